@@ -1,0 +1,200 @@
+"""What sets β, the weight of the curiosity bonus, episode by episode.
+
+One interface, `BetaController`; an exponential schedule and the meta-adaptation network stand
+behind it.
+"""
+
+from collections import deque
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete
+from torch import Tensor, nn
+
+from mace_rl.environments import Environment
+from mace_rl.hyperparameters import ExponentialBeta, MetaConfig, RunConfig
+from mace_rl.rollout import Episode
+from mace_rl.standardise import RunningStandardiser
+from mace_rl.streams import torch_generator
+
+
+class BetaController(Protocol):
+    """Sets β for the next episode from what happened in the last."""
+
+    beta: float  # of the next episode
+    learns: bool  # whether `learn` wants policy gradients
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """Take in a finished episode and its curiosity bonus, [T]; set `beta` for the next."""
+
+    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+        """After each rollout, before the policy's update on it: the flat policy gradients.
+
+        extrinsic: g_E of the whole rollout; intrinsic: g_I of each of its episodes, in order.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class ExponentialSchedule:
+    """β_n = max(floor, initial · decay^(n-1)): the paper's ablation with a fixed schedule."""
+
+    learns = False
+
+    def __init__(self, config: ExponentialBeta) -> None:
+        self.config = config
+        self.episodes = 0
+
+    @property
+    def beta(self) -> float:
+        """β of the next episode."""
+        return max(self.config.floor, self.config.initial * self.config.decay**self.episodes)
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """See `BetaController`."""
+        self.episodes += 1
+
+    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+        """See `BetaController`; a schedule does not learn."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `BetaController`."""
+        return {"episodes": self.episodes}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `BetaController`."""
+        self.episodes = state["episodes"]
+
+
+class MetaNetwork(nn.Module):
+    """LSTM over one episode, its last state mapped to β in (0, 1)."""
+
+    def __init__(
+        self, input_size: int, config: MetaConfig, initial: float, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.lstm = nn.LSTM(input_size, config.hidden_units, batch_first=True)
+        self.output = nn.Linear(config.hidden_units, 1)
+        bound = config.hidden_units**-0.5
+        for parameter in self.parameters():
+            nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        # Untrained it answers about `initial` to every episode.
+        nn.init.uniform_(self.output.weight, -0.01, 0.01, generator=generator)
+        nn.init.constant_(self.output.bias, float(np.log(initial / (1 - initial))))
+
+    def forward(self, sequence: Tensor) -> Tensor:
+        """β, [], from one episode, [T, input]."""
+        _, (hidden, _) = self.lstm(sequence[None])
+        return torch.sigmoid(self.output(hidden[-1, 0]))[0]
+
+
+class MetaAdaptation:
+    """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
+
+    An update on episode n moves the policy by η (g_E + β_n g_I). How the extrinsic return of the
+    policy that results depends on β_n is therefore
+
+        dJ_E / dβ_n ≈ η ⟨g_E(θ'; episode n+1), g_I(θ; episode n)⟩
+
+    and by the chain rule through β_n = LSTM_φ(episode n-1) it trains φ. The two gradients are
+    scaled to length 1 first, which keeps the sign and leaves outliers no more weight than others.
+    """
+
+    learns = True
+
+    def __init__(self, config: RunConfig, environment: Environment) -> None:
+        self.config = config.meta
+        actions = environment.action_space
+        self.action_count = int(actions.n) if isinstance(actions, Discrete) else 0
+        action_size = self.action_count or actions.shape[0]
+        self.network = MetaNetwork(
+            environment.observation_size + action_size + 2,
+            self.config,
+            config.beta.initial,
+            torch_generator(config.seed, "meta"),
+        )
+        self.optimiser = torch.optim.Adam(
+            self.network.parameters(), self.config.learning_rate, fused=True
+        )
+        self.standardiser = RunningStandardiser(environment.observation_size)
+        self.beta: float = config.beta.initial
+        # What gave rise to the β of each episode since the last `learn`, and to that of the next;
+        # None for the first episode, whose β is given.
+        self.sources: deque[Tensor | None] = deque([None])
+        # The same with g_I for the episodes of the last rollout, whose effect is not yet known.
+        self.pending: list[tuple[Tensor | None, Tensor]] = []
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """See `BetaController`."""
+        self.standardiser.update(episode.observations[:-1])
+        sequence = self.sequence(episode, bonus)
+        self.sources.append(sequence)
+        with torch.no_grad():
+            self.beta = float(self.network(sequence))
+
+    def sequence(self, episode: Episode, bonus: np.ndarray) -> Tensor:
+        """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
+
+        float32 [min(T, max_sequence), input]; longer episodes are averaged over equal stretches.
+        """
+        actions = episode.actions
+        if self.action_count:
+            actions = np.eye(self.action_count, dtype=np.float32)[actions]
+        columns = [
+            self.standardiser(episode.observations[:-1]),
+            actions,
+            episode.rewards[:, None],
+            bonus[:, None],
+        ]
+        sequence = np.concatenate(columns, axis=1)
+        length = self.config.max_sequence
+        if length is not None and len(sequence) > length:
+            starts = np.linspace(0, len(sequence), length, endpoint=False).astype(np.int64)
+            counts = np.diff(starts, append=len(sequence))
+            sequence = np.add.reduceat(sequence, starts) / counts[:, None]
+        return torch.from_numpy(sequence.astype(np.float32))
+
+    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+        """See `BetaController`: credit the βs of the last rollout, then remember this one's."""
+        credited = [
+            (sequence, float(alignment(extrinsic, gradient)))
+            for sequence, gradient in self.pending
+            if sequence is not None
+        ]
+        if credited:
+            loss = -sum(self.network(sequence) * credit for sequence, credit in credited)
+            self.optimiser.zero_grad()
+            (loss / len(credited)).backward()
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_gradient_norm)
+            self.optimiser.step()
+        self.pending = [(self.sources.popleft(), gradient) for gradient in intrinsic]
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `BetaController`."""
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "standardiser": self.standardiser.state_dict(),
+            "beta": self.beta,
+            "sources": list(self.sources),
+            "pending": self.pending,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `BetaController`."""
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.standardiser.load_state_dict(state["standardiser"])
+        self.beta = state["beta"]
+        self.sources = deque(state["sources"])
+        self.pending = list(state["pending"])
+
+
+def alignment(extrinsic: Tensor, intrinsic: Tensor) -> Tensor:
+    """⟨g_E, g_I⟩ / (|g_E| |g_I|), in [-1, 1]; 0 where either is 0."""
+    return nn.functional.cosine_similarity(extrinsic, intrinsic, dim=0)

@@ -1,0 +1,84 @@
+"""Checkpoints and agents on disk: written atomically, read without executing anything.
+
+A checkpoint is `sha256 of the rest, newline, torch archive`. It carries the identity of the run
+it belongs to (configuration, code, versions); one of another identity is never continued.
+"""
+
+import hashlib
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+class CheckpointError(ValueError):
+    """A file that is damaged or belongs to another run; the message names it and says why."""
+
+
+def write_bytes_atomically(path: Path, content: bytes) -> None:
+    """Replace `path` by `content` so that a crash leaves the old file or the new one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def archive(content: dict[str, Any]) -> bytes:
+    """`content` (tensors, numbers, strings, lists, dicts) as a torch archive.
+
+    Equal content gives equal bytes.
+    """
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
+    """Read back what `archive` wrote; nothing but plain data is accepted (`weights_only`)."""
+    try:
+        return torch.load(io.BytesIO(data), weights_only=True)
+    except Exception as error:  # torch reports damage by many types
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
+
+
+def save(path: Path, identity: dict[str, Any], state: dict[str, Any]) -> None:
+    """Write a checkpoint of the run with this `identity`."""
+    data = archive({"identity": identity, "state": state})
+    write_bytes_atomically(path, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+
+
+def load(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    """The state in a checkpoint.
+
+    Raises `CheckpointError` if the file is cut off or altered, or if its identity is not
+    `identity`; the message then names what differs.
+    """
+    digest, _, data = path.read_bytes().partition(b"\n")
+    if hashlib.sha256(data).hexdigest().encode() != digest:
+        raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
+    content = unarchive(data, path)
+    found = content["identity"]
+    if found != identity:
+        raise CheckpointError(f"{path}: of another run: {difference(found, identity)}")
+    return content["state"]
+
+
+def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
+    """The first key in which two nested dictionaries differ, with both values."""
+    for key in [*wanted, *(key for key in found if key not in wanted)]:
+        name = f"{prefix}{key}"
+        old, new = found.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            if old != new:
+                return difference(old, new, f"{name}.")
+        elif old != new:
+            return f"{name} was {old!r} and is {new!r}"
+    return "no difference"

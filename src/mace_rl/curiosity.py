@@ -1,0 +1,91 @@
+"""The curiosity bonus: novelty × what the episodic memory says of similar states (paper)."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mace_rl.environments import Environment
+from mace_rl.hyperparameters import RunConfig
+from mace_rl.memory import EpisodicMemory, Recollection
+from mace_rl.novelty import CountNovelty, DensityNovelty, Novelty
+from mace_rl.rollout import Episode
+from mace_rl.standardise import RunningStandardiser
+
+
+def relevance(recollection: Recollection, returns: Tensor) -> Tensor:
+    """Memory relevance in [0, 1], [N]: 1 - similarity · (1 - productivity).
+
+    Productivity is where the remembered return-to-go lies among all `returns` in memory, [M]: the
+    logistic function of its distance from their mean in standard deviations. So a state unlike
+    anything remembered has relevance 1, one like unproductive states goes toward 0, and one like
+    productive states stays near 1.
+    """
+    spread = returns.std(correction=0).clamp(min=1e-8)
+    productivity = torch.sigmoid((recollection.values[:, -1] - returns.mean()) / spread)
+    return 1 - recollection.similarity * (1 - productivity)
+
+
+class Curiosity:
+    """R_curiosity of every step, and the memory and novelty estimates it rests on.
+
+    An episode is rewarded for what was known before it; `remember` adds it to what is known.
+    """
+
+    def __init__(self, config: RunConfig, environment: Environment) -> None:
+        size = environment.observation_size
+        self.config = config
+        self.memory = EpisodicMemory(config.memory, size)
+        # States are compared in running standardisation; one-hot states as they are.
+        self.embedding = RunningStandardiser(size)
+        self.discrete = environment.discrete_observations
+        self.novelty: Novelty = (
+            CountNovelty(config.novelty, size)
+            if self.discrete
+            else DensityNovelty(config.novelty, size, config.seed, self.embedding)
+        )
+
+    def bonus(self, episode: Episode) -> np.ndarray:
+        """R_curiosity of each step: novelty × relevance of the state it led to, float64 [T]."""
+        states = episode.observations[1:]
+        novelty = self.novelty(states)
+        if len(self.memory) == 0:
+            return novelty
+        with torch.no_grad():
+            recollection = self.memory.lookup(
+                torch.from_numpy(states),
+                torch.from_numpy(self.embedding.mean.astype(np.float32)),
+                torch.from_numpy(self.embedding.std.astype(np.float32)),
+            )
+            return novelty * relevance(recollection, self.memory.returns).double().numpy()
+
+    def remember(self, episode: Episode, returns: np.ndarray) -> None:
+        """Make the episode part of memory and of what is no longer novel.
+
+        returns: extrinsic return-to-go of each step, [T].
+        """
+        chosen = slice(None, None, self.config.memory.write_every)
+        self.memory.write(
+            torch.from_numpy(episode.observations[:-1][chosen]),
+            torch.from_numpy(episode.observations[1:][chosen]),
+            torch.from_numpy(episode.rewards[chosen]),
+            torch.from_numpy(returns[chosen]),
+        )
+        if not self.discrete:
+            self.embedding.update(episode.observations[1:])
+        self.novelty.observe(episode.observations[1:])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+        return {
+            "memory": self.memory.state_dict(),
+            "embedding": self.embedding.state_dict(),
+            "novelty": self.novelty.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.memory.load_state_dict(state["memory"])
+        self.embedding.load_state_dict(state["embedding"])
+        self.novelty.load_state_dict(state["novelty"])

@@ -1,0 +1,159 @@
+"""Novelty of states, in [0, 1]: visitation counts, or k-NN distances and a density estimator."""
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from mace_rl.density import MADE
+from mace_rl.hyperparameters import NoveltyConfig
+from mace_rl.standardise import RunningStandardiser
+from mace_rl.streams import numpy_generator, torch_generator
+
+
+class Novelty(Protocol):
+    """How new the states of an episode are; `observe` then makes them known."""
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """Novelty of each state, [T, observation] → float64 [T] in [0, 1]."""
+
+    def observe(self, states: np.ndarray) -> None:
+        """Take in an episode's states, [T, observation]."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class CountNovelty:
+    """1 / n(s) with counts that decay (paper, supplement): for Discrete observations.
+
+    n(s) counts this visit too, those earlier in the episode included, so a first visit has
+    novelty 1. After each episode all counts are multiplied by `count_decay`.
+    """
+
+    def __init__(self, config: NoveltyConfig, observation_size: int) -> None:
+        self.config = config
+        self.counts = np.zeros(observation_size)
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """See `Novelty`; states are one-hot."""
+        counts = self.counts.copy()
+        novelty = np.empty(len(states))
+        for t, state in enumerate(states.argmax(axis=1)):
+            counts[state] += 1
+            novelty[t] = 1 / max(counts[state], 1.0)
+        return novelty
+
+    def observe(self, states: np.ndarray) -> None:
+        """See `Novelty`; states are one-hot."""
+        self.counts = (self.counts + states.sum(axis=0)) * self.config.count_decay
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Novelty`."""
+        return {"counts": torch.from_numpy(self.counts.copy())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `Novelty`."""
+        self.counts = state["counts"].numpy().copy()
+
+
+class DensityNovelty:
+    """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
+
+    Both refer to a buffer of the last visited states, standardised by `embedding`, whose owner
+    keeps it up to date.
+
+    - k-NN: 1 - exp(-d_k), d_k the mean distance to the k nearest visited states, per dimension
+      (root mean square); the mean over the ensemble's ks.
+    - Density: the fraction of visited states at which the estimator, trained on the buffer after
+      each episode, finds a higher density than here.
+    """
+
+    def __init__(
+        self,
+        config: NoveltyConfig,
+        observation_size: int,
+        seed: int,
+        embedding: RunningStandardiser,
+    ) -> None:
+        self.config = config
+        self.embedding = embedding
+        self.buffer = np.zeros((config.buffer_size, observation_size), np.float32)
+        self.seen = 0  # states ever written; the buffer is a ring
+        self.density = MADE(
+            observation_size, config.density_hidden_units, torch_generator(seed, "density")
+        )
+        self.optimiser = torch.optim.Adam(
+            self.density.parameters(), config.density_learning_rate, fused=True
+        )
+        self.batches = numpy_generator(seed, "density_batches")
+        self.reference = torch.zeros(0)  # sorted log-densities of visited states
+
+    @property
+    def visited(self) -> np.ndarray:
+        """The states in the buffer, [n, observation]."""
+        return self.buffer[: min(self.seen, len(self.buffer))]
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """See `Novelty`. Before anything was visited everything has novelty 1."""
+        if self.seen == 0:
+            return np.ones(len(states))
+        weight = self.config.knn_weight
+        return weight * self.knn_novelty(states) + (1 - weight) * self.density_novelty(states)
+
+    def knn_novelty(self, states: np.ndarray) -> np.ndarray:
+        """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
+        visited = self.embedding(self.visited)
+        largest = min(max(self.config.neighbours), len(visited))
+        distances, _ = cKDTree(visited).query(self.embedding(states), k=[*range(1, largest + 1)])
+        distances /= np.sqrt(states.shape[1])
+        ensemble = [
+            1 - np.exp(-distances[:, :neighbours].mean(axis=1))
+            for neighbours in self.config.neighbours
+        ]
+        return np.mean(ensemble, axis=0)
+
+    @torch.no_grad()
+    def density_novelty(self, states: np.ndarray) -> np.ndarray:
+        """The density part, [T, observation] → float64 [T] in [0, 1]."""
+        log_probs = self.density.log_prob(torch.from_numpy(self.embedding(states)))
+        lower = torch.searchsorted(self.reference, log_probs)
+        return 1 - lower.double().numpy() / len(self.reference)
+
+    def observe(self, states: np.ndarray) -> None:
+        """Add an episode's states to the buffer and train the density estimator on it."""
+        places = np.arange(self.seen, self.seen + len(states)) % len(self.buffer)
+        self.buffer[places] = states
+        self.seen += len(states)
+        visited = self.visited
+        for _ in range(self.config.density_steps):
+            index = self.batches.integers(len(visited), size=self.config.density_batch_size)
+            log_probs = self.density.log_prob(torch.from_numpy(self.embedding(visited[index])))
+            self.optimiser.zero_grad()
+            (-log_probs.mean()).backward()
+            self.optimiser.step()
+        self.reference = log_probs.detach().sort().values
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Novelty`."""
+        return {
+            "buffer": torch.from_numpy(self.visited.copy()),
+            "seen": self.seen,
+            "density": self.density.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "batches": self.batches.bit_generator.state,
+            "reference": self.reference,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `Novelty`."""
+        self.buffer[: len(state["buffer"])] = state["buffer"].numpy()
+        self.seen = state["seen"]
+        self.density.load_state_dict(state["density"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.batches.bit_generator.state = state["batches"]
+        self.reference = state["reference"].clone()

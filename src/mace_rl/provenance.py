@@ -1,0 +1,97 @@
+"""Where a result comes from: code, versions, machine."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).parent
+
+# The modules that a run's results depend on: a change in any of them retrains.
+TRAINING_MODULES = (
+    "__init__",
+    "beta",
+    "checkpoint",
+    "compiled",
+    "curiosity",
+    "density",
+    "environments",
+    "finite",
+    "hopper",
+    "hyperparameters",
+    "memory",
+    "novelty",
+    "policy",
+    "ppo",
+    "provenance",
+    "records",
+    "rollout",
+    "run",
+    "standardise",
+    "streams",
+    "train",
+)
+TRAINING_SOURCES = tuple(PACKAGE / f"{name}.py" for name in TRAINING_MODULES)
+
+# The packages whose version can change a result.
+PACKAGES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "numba",
+    "llvmlite",
+    "gymnasium",
+    "pybullet",
+    "pybullet-envs-gymnasium",
+)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def source_digest() -> str:
+    """SHA-256 over the training sources, names included."""
+    lines = [f"{path.name} {file_digest(path)}\n" for path in TRAINING_SOURCES]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Python's version and those of `PACKAGES`."""
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version()} | found
+
+
+def git_state() -> dict[str, Any]:
+    """Commit and whether tracked files differ from it; both None outside a git checkout."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(PACKAGE), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return {
+            "commit": git("rev-parse", "HEAD"),
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no")),
+        }
+    except (FileNotFoundError, subprocess.CalledProcessError):  # no git, or no repository
+        return {"commit": None, "dirty": None}
+
+
+def cpu_model() -> str:
+    """The processor's name as the system gives it."""
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine() -> dict[str, Any]:
+    """Processor, its number of cores, and the system."""
+    return {"cpu": cpu_model(), "cores": os.cpu_count(), "system": platform.platform()}

@@ -1,0 +1,115 @@
+"""Acting: one episode with the current policy.
+
+`roll_out` steps any environment; CartPole-v1 and Acrobot-v1 run in one compiled loop instead,
+which gives the same episode to the bit. Callers cannot tell which one ran.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
+
+from mace_rl import compiled
+from mace_rl.environments import Environment
+from mace_rl.finite import require_finite
+from mace_rl.policy import ActingPolicy
+
+# The version whose CartPole and Acrobot the compiled steps were compared with.
+COMPILED_FOR_GYMNASIUM = "1.4.0"
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of T steps as it was played."""
+
+    observations: np.ndarray  # float32 [T + 1, observation], the last one after the last step
+    actions: np.ndarray  # int64 [T] from 0, or float32 [T, actions] before clipping
+    log_probs: np.ndarray  # float32 [T], of the actions when they were taken
+    rewards: np.ndarray  # float64 [T], extrinsic
+    terminated: bool  # False: cut off by the time limit
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def draw_noise(environment: Environment, generator: np.random.Generator) -> np.ndarray:
+    """The random numbers that turn policy outputs into actions, for a whole episode.
+
+    Drawn before the episode and always up to the time limit, so that both rollouts use up the
+    stream alike. Uniform, [max_steps], for Discrete actions; else standard normal,
+    [max_steps, actions].
+    """
+    if isinstance(environment.action_space, gymnasium.spaces.Discrete):
+        return generator.random(environment.max_steps)
+    return generator.standard_normal((environment.max_steps, environment.action_space.shape[0]))
+
+
+def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
+    """Play one episode by stepping the environment; see `Episode`."""
+    env, space = environment.env, environment.action_space
+    discrete = isinstance(space, gymnasium.spaces.Discrete)
+    observations, actions, log_probs, rewards = [], [], [], []
+    observation, _ = env.reset()
+    observations.append(environment.encode(observation))
+    terminated = truncated = False
+    while not (terminated or truncated):
+        step = len(rewards)
+        if discrete:
+            action, log_prob = compiled.act_discrete(observations[step], *policy[:5], noise[step])
+            env_action = action + int(space.start)
+        else:
+            action, log_prob = compiled.act_box(observations[step], *policy, noise[step])
+            env_action = np.clip(action, space.low, space.high)
+        observation, reward, terminated, truncated, _ = env.step(env_action)
+        where = f" after step {step + 1}"
+        require_finite("the reward", reward, where)
+        require_finite("the observation", observation, where)
+        observations.append(environment.encode(observation))
+        actions.append(action)
+        log_probs.append(log_prob)
+        rewards.append(float(reward))
+    return Episode(
+        observations=np.stack(observations),
+        actions=np.array(actions, np.int64) if discrete else np.stack(actions),
+        log_probs=np.array(log_probs, np.float32),
+        rewards=np.array(rewards),
+        terminated=bool(terminated),
+    )
+
+
+def roll_out_compiled(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
+    """Play one episode of CartPole-v1 or Acrobot-v1 in compiled code, equal to `roll_out`."""
+    observation, _ = environment.env.reset()
+    inner = environment.env.unwrapped
+    which = compiled.CARTPOLE if isinstance(inner, CartPoleEnv) else compiled.ACROBOT
+    return Episode(
+        *compiled.classic_control_episode(
+            which, np.array(inner.state, np.float64), observation, *policy[:5], noise
+        )
+    )
+
+
+def rollout_for(
+    environment: Environment,
+) -> Callable[[Environment, ActingPolicy, np.ndarray], Episode]:
+    """The fastest rollout that is exact for this environment.
+
+    The compiled one needs the very classes, default parameters and version it was compared with,
+    and sines, cosines and powers in NumPy that equal the C library's.
+    """
+    known = environment.name in ("CartPole-v1", "Acrobot-v1") and type(
+        environment.env.unwrapped
+    ) in (CartPoleEnv, AcrobotEnv)
+    if not known or gymnasium.__version__ != COMPILED_FOR_GYMNASIUM:
+        return roll_out
+    angles = np.linspace(-10, 10, 1000)
+    same = all(
+        np.sin(angle) == math.sin(angle)
+        and np.cos(angle) == math.cos(angle)
+        and angle**2 == math.pow(angle, 2.0)
+        for angle in angles
+    )
+    return roll_out_compiled if same else roll_out

@@ -1,0 +1,195 @@
+"""Carrying out one run on disk: train, save checkpoints, resume, write the results.
+
+In the run's folder: `episodes.csv`, `agent.pt` and, last, `run.json` are the results; while it
+runs there are also `checkpoint.pt`, from which the same call resumes to the bit, and
+`progress.json` for whoever watches.
+"""
+
+import fcntl
+import json
+import logging
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mace_rl import checkpoint, provenance
+from mace_rl.hyperparameters import RunConfig
+from mace_rl.records import write_atomically, write_episodes
+from mace_rl.train import Record, Trainer
+
+logger = logging.getLogger(__name__)
+
+PROGRESS_SECONDS = 2.0
+# A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
+CHECKPOINT_SECONDS = 10.0
+CHECKPOINT_COST = 0.01
+
+
+class RunError(RuntimeError):
+    """A run that cannot be carried out in its folder; the message says why."""
+
+
+def run(config: RunConfig, directory: Path) -> None:
+    """Train as `config` says and leave `episodes.csv`, `agent.pt` and `run.json` in `directory`.
+
+    Continues from `checkpoint.pt` if there is one of this very configuration, code and versions;
+    otherwise says so in the log and starts afresh. Uses one thread. Raises `RunError` if another
+    process is at work in `directory`.
+    """
+    torch.set_num_threads(1)
+    directory.mkdir(parents=True, exist_ok=True)
+    with exclusive(directory):
+        started = time.monotonic()
+        trainer = Trainer(config)
+        identity = run_identity(config)
+        before, interruptions = resume(trainer, directory / "checkpoint.pt", identity)
+        clock = Clock(started - before)
+        for _ in trainer.run():
+            if clock.progress_due():
+                write_progress(directory, trainer, clock)
+            if clock.checkpoint_due():
+                with clock.saving():
+                    checkpoint.save(
+                        directory / "checkpoint.pt",
+                        identity,
+                        {
+                            "trainer": trainer.state_dict(),
+                            "seconds": clock.elapsed(),
+                            "interruptions": interruptions,
+                        },
+                    )
+        write_results(directory, trainer, identity, clock, interruptions)
+        for name in ("checkpoint.pt", "progress.json"):
+            (directory / name).unlink(missing_ok=True)
+
+
+def run_identity(config: RunConfig) -> dict[str, Any]:
+    """What must be equal for a checkpoint to be continued."""
+    return {
+        "config": config.model_dump(),
+        "versions": provenance.versions(),
+        "sources": provenance.source_digest(),
+    }
+
+
+def resume(trainer: Trainer, path: Path, identity: dict[str, Any]) -> tuple[float, int]:
+    """Continue from the checkpoint at `path`, if it is this run's.
+
+    Returns the seconds already spent and how often the run has been interrupted.
+    """
+    if not path.exists():
+        return 0.0, 0
+    try:
+        state = checkpoint.load(path, identity)
+    except checkpoint.CheckpointError as error:
+        logger.warning("starting afresh: %s", error)
+        return 0.0, 0
+    trainer.load_state_dict(state["trainer"])
+    logger.info("resuming after episode %d", len(trainer.records))
+    return state["seconds"], state["interruptions"] + 1
+
+
+class Clock:
+    """Training time, and when progress and checkpoints are due; seconds."""
+
+    def __init__(self, start: float) -> None:
+        self.start = start
+        self.next_progress = time.monotonic()
+        self.next_checkpoint = time.monotonic() + CHECKPOINT_SECONDS
+        self.checkpoint_seconds = 0.0  # spent on checkpoints in this process
+
+    def elapsed(self) -> float:
+        """Seconds of this run, those before interruptions included."""
+        return time.monotonic() - self.start
+
+    def progress_due(self) -> bool:
+        """Whether `PROGRESS_SECONDS` have passed since this last returned True."""
+        now = time.monotonic()
+        if now < self.next_progress:
+            return False
+        self.next_progress = now + PROGRESS_SECONDS
+        return True
+
+    def checkpoint_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return time.monotonic() >= self.next_checkpoint
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Measure a checkpoint and set the time of the next."""
+        start = time.monotonic()
+        yield
+        cost = time.monotonic() - start
+        self.checkpoint_seconds += cost
+        self.next_checkpoint = start + max(CHECKPOINT_SECONDS, cost / CHECKPOINT_COST)
+
+
+@contextmanager
+def exclusive(directory: Path) -> Iterator[None]:
+    """Hold the run's folder for this process; the lock goes with the process, however it ends."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise RunError(f"{directory}: another process is training in this folder") from None
+    finally:
+        os.close(descriptor)
+
+
+def write_progress(directory: Path, trainer: Trainer, clock: Clock) -> None:
+    """Replace `progress.json`, which `mace_rl.progress` reads."""
+    records = trainer.records
+    elapsed = clock.elapsed()
+    progress = {
+        "episode": len(records),
+        "episodes": trainer.config.episodes,
+        "recent_return": float(np.mean([record.extrinsic_return for record in records[-50:]])),
+        "env_steps": records[-1].env_steps,
+        "steps_per_second": records[-1].env_steps / elapsed,
+        "seconds": elapsed,
+        "time": time.time(),
+        "pid": os.getpid(),
+    }
+    write_atomically(directory / "progress.json", json.dumps(progress))
+
+
+def write_results(
+    directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock, interruptions: int
+) -> None:
+    """Write the records, the agent and, when those are safe, where they come from."""
+    write_episodes(
+        directory / "episodes.csv",
+        {
+            field.name: np.array([getattr(record, field.name) for record in trainer.records])
+            for field in fields(Record)
+        },
+    )
+    agent = checkpoint.archive(trainer.agent())
+    checkpoint.write_bytes_atomically(directory / "agent.pt", agent)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux
+    origin = identity | {
+        "code": provenance.git_state(),
+        "machine": provenance.machine(),
+        "threads": torch.get_num_threads(),
+        "command": sys.argv,
+        "seconds": clock.elapsed(),
+        "checkpoint_seconds": clock.checkpoint_seconds,
+        "interruptions": interruptions,
+        "peak_memory_mb": peak / 1024,
+        "outputs": {
+            name: provenance.file_digest(directory / name) for name in ("episodes.csv", "agent.pt")
+        },
+    }
+    write_atomically(
+        directory / "run.json", json.dumps(origin, indent=2, ensure_ascii=False) + "\n"
+    )

@@ -1,0 +1,231 @@
+"""MACE-RL, the whole method: read this file first.
+
+    R_total = R_extrinsic + β · R_curiosity                                            (paper)
+
+One `Trainer` is one run. Each round plays whole episodes with the current policy, weighs the
+curiosity bonus of each episode with its β, updates the policy by PPO, and lets the episodes become
+memory. The phases are methods, named after the paper's terms; what they use is in the file of
+that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta`, `ppo`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from mace_rl.beta import BetaController, ExponentialSchedule, MetaAdaptation
+from mace_rl.curiosity import Curiosity
+from mace_rl.environments import Environment
+from mace_rl.finite import NonFiniteError, require_finite
+from mace_rl.hyperparameters import ExponentialBeta, MetaBeta, NoBonus, RunConfig
+from mace_rl.ppo import PPO, Batch
+from mace_rl.rollout import Episode, draw_noise, rollout_for
+from mace_rl.streams import numpy_generator
+
+
+@dataclass(frozen=True)
+class Record:
+    """One row of episodes.csv."""
+
+    episode: int  # from 1
+    env_steps: int  # since the start of training, this episode included
+    length: int
+    extrinsic_return: float  # undiscounted
+    intrinsic_return: float  # sum of the bonus, not weighted by β
+    beta: float
+    terminated: int  # 0: cut off by the time limit
+
+
+@dataclass(frozen=True)
+class Experience:
+    """An episode with all that the update needs of it; arrays are [T]."""
+
+    episode: Episode
+    observations: torch.Tensor  # float32 [T + 1, observation], normalised as the networks see them
+    beta: float
+    bonus: np.ndarray  # R_curiosity
+    extrinsic_advantages: np.ndarray
+    extrinsic_returns: np.ndarray
+    intrinsic_advantages: np.ndarray  # zeros without a bonus, like the next
+    intrinsic_returns: np.ndarray
+
+
+def beta_controller(config: RunConfig, environment: Environment) -> BetaController | None:
+    """What sets β in this variant; None for plain PPO."""
+    match config.beta:
+        case NoBonus():
+            return None
+        case ExponentialBeta():
+            return ExponentialSchedule(config.beta)
+        case MetaBeta():
+            return MetaAdaptation(config, environment)
+
+
+class Trainer:
+    """One training run; iterate over `run` to carry it out."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self.config = config
+        self.environment = Environment(config.environment, config.seed)
+        self.rollout = rollout_for(self.environment)
+        self.noise = numpy_generator(config.seed, "actions")
+        self.controller = beta_controller(config, self.environment)
+        self.curiosity = Curiosity(config, self.environment) if self.controller else None
+        self.ppo = PPO(config.ppo, self.environment, config.seed, self.curiosity is not None)
+        self.records: list[Record] = []
+
+    def run(self) -> Iterator[list[Record]]:
+        """Train to the last episode; yields the records of each round after its update.
+
+        Raises `NonFiniteError` as soon as a number goes bad, before its round is yielded.
+        """
+        while len(self.records) < self.config.episodes:
+            start = len(self.records)
+            try:
+                rollout = self.collect()
+                self.adapt(rollout)
+                self.improve(rollout)
+            except NonFiniteError as error:
+                run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
+                raise NonFiniteError(f"{run}, episode {len(self.records) + 1}: {error}") from None
+            yield self.records[start:]
+
+    def collect(self) -> list[Experience]:
+        """Play episodes with the current policy until a rollout is full."""
+        policy = self.ppo.acting_policy()
+        rollout: list[Experience] = []
+        steps = 0
+        while steps < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes:
+            noise = draw_noise(self.environment, self.noise)
+            episode = self.rollout(self.environment, policy, noise)
+            rollout.append(self.appraise(episode))
+            steps += len(episode)
+        return rollout
+
+    def appraise(self, episode: Episode) -> Experience:
+        """Curiosity bonus, advantages and β of a finished episode; then β for the next."""
+        observations = self.ppo.normalise(episode.observations)
+        beta, bonus = 0.0, np.zeros(len(episode))
+        intrinsic = bonus, bonus
+        extrinsic = self.ppo.advantages_and_returns(
+            "extrinsic", observations, episode.rewards, episode.terminated
+        )
+        if self.curiosity and self.controller:
+            beta = self.controller.beta
+            bonus = self.curiosity.bonus(episode)
+            require_finite("the curiosity bonus", bonus)
+            intrinsic = self.ppo.advantages_and_returns(
+                "intrinsic", observations, bonus, episode.terminated
+            )
+            self.curiosity.remember(episode, extrinsic[1])
+            self.controller.next_episode(episode, bonus)
+            require_finite("β", self.controller.beta)
+        before = self.records[-1].env_steps if self.records else 0
+        self.records.append(
+            Record(
+                episode=len(self.records) + 1,
+                env_steps=before + len(episode),
+                length=len(episode),
+                extrinsic_return=float(episode.rewards.sum()),
+                intrinsic_return=float(bonus.sum()),
+                beta=beta,
+                terminated=int(episode.terminated),
+            )
+        )
+        return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic)
+
+    def adapt(self, rollout: list[Experience]) -> None:
+        """Meta-adaptation: show the network where extrinsic and intrinsic reward push the policy.
+
+        Both gradients are of the policy that played the rollout, before its update.
+        """
+        if not (self.controller and self.controller.learns):
+            return
+        log_probs, _ = self.ppo.actor.log_prob_and_entropy(
+            torch.cat([item.observations[:-1] for item in rollout]),
+            torch.from_numpy(np.concatenate([item.episode.actions for item in rollout])),
+        )
+        extrinsic = centred([item.extrinsic_advantages for item in rollout])
+        intrinsic = centred([item.intrinsic_advantages for item in rollout])
+        lengths = [len(item.episode) for item in rollout]
+        self.controller.learn(
+            self.ppo.policy_gradient(log_probs, extrinsic),
+            [
+                self.ppo.policy_gradient(*episode)
+                for episode in zip(log_probs.split(lengths), intrinsic.split(lengths), strict=True)
+            ],
+        )
+
+    def improve(self, rollout: list[Experience]) -> None:
+        """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
+        total = centred(
+            [item.extrinsic_advantages + item.beta * item.intrinsic_advantages for item in rollout]
+        )
+        returns = {"extrinsic": as_tensor([item.extrinsic_returns for item in rollout])}
+        if self.curiosity:
+            returns["intrinsic"] = as_tensor([item.intrinsic_returns for item in rollout])
+        outcome = self.ppo.update(
+            Batch(
+                observations=torch.cat([item.observations[:-1] for item in rollout]),
+                actions=torch.from_numpy(
+                    np.concatenate([item.episode.actions for item in rollout])
+                ),
+                log_probs=as_tensor([item.episode.log_probs for item in rollout]),
+                advantages=total / (total.std(correction=0) + 1e-8),
+                returns=returns,
+            )
+        )
+        # NaN or Inf in any epoch spreads to the weights and so to the last epoch's figures.
+        for name, value in outcome.items():
+            require_finite(name, value)
+        for item in rollout:
+            self.ppo.standardiser.update(item.episode.observations[:-1])
+
+    def agent(self) -> dict[str, Any]:
+        """The policy and critics as they are now, with the observation normaliser."""
+        state = self.ppo.state_dict()
+        return {name: state[name] for name in ("actor", "critics", "standardiser")}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the rest of the run depends on, at the end of a round."""
+        return {
+            "ppo": self.ppo.state_dict(),
+            "curiosity": self.curiosity.state_dict() if self.curiosity else None,
+            "controller": self.controller.state_dict() if self.controller else None,
+            "noise": self.noise.bit_generator.state,
+            "environment": self.environment.generator.bit_generator.state,
+            "records": {
+                field.name: torch.tensor(
+                    [getattr(record, field.name) for record in self.records],
+                    dtype=torch.float64 if field.type is float else torch.int64,
+                )
+                for field in fields(Record)
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
+        self.ppo.load_state_dict(state["ppo"])
+        if self.curiosity and self.controller:
+            self.curiosity.load_state_dict(state["curiosity"])
+            self.controller.load_state_dict(state["controller"])
+        self.noise.bit_generator.state = state["noise"]
+        self.environment.generator.bit_generator.state = state["environment"]
+        columns = {name: column.tolist() for name, column in state["records"].items()}
+        self.records = [
+            Record(**dict(zip(columns, row, strict=True)))
+            for row in zip(*columns.values(), strict=True)
+        ]
+
+
+def as_tensor(pieces: list[np.ndarray]) -> torch.Tensor:
+    """The episodes' arrays one after the other, float32 [N]."""
+    return torch.from_numpy(np.concatenate(pieces).astype(np.float32))
+
+
+def centred(advantages: list[np.ndarray]) -> torch.Tensor:
+    """The episodes' advantages minus their common mean, float32 [N]."""
+    joined = np.concatenate(advantages)
+    return torch.from_numpy((joined - joined.mean()).astype(np.float32))
