@@ -28,7 +28,7 @@ class BetaController(Protocol):
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """Take in a finished episode and its curiosity bonus, [T]; set `beta` for the next."""
 
-    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+    def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """After each rollout, before the policy's update on it: the flat policy gradients.
 
         extrinsic: g_E of the whole rollout; intrinsic: g_I of each of its episodes, in order.
@@ -59,7 +59,7 @@ class ExponentialSchedule:
         """See `BetaController`."""
         self.episodes += 1
 
-    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+    def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """See `BetaController`; a schedule does not learn."""
 
     def state_dict(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class MetaAdaptation:
         # None for the first episode, whose β is given.
         self.sources: deque[Tensor | None] = deque([None])
         # The same with g_I for the episodes of the last rollout, whose effect is not yet known.
-        self.pending: list[tuple[Tensor | None, Tensor]] = []
+        self.pending: list[tuple[Tensor | None, np.ndarray]] = []
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
@@ -159,10 +159,10 @@ class MetaAdaptation:
             sequence = np.add.reduceat(sequence, starts) / counts[:, None]
         return torch.from_numpy(sequence.astype(np.float32))
 
-    def learn(self, extrinsic: Tensor, intrinsic: list[Tensor]) -> None:
+    def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """See `BetaController`: credit the βs of the last rollout, then remember this one's."""
         credited = [
-            (sequence, float(alignment(extrinsic, gradient)))
+            (sequence, alignment(extrinsic, gradient))
             for sequence, gradient in self.pending
             if sequence is not None
         ]
@@ -182,7 +182,9 @@ class MetaAdaptation:
             "standardiser": self.standardiser.state_dict(),
             "beta": self.beta,
             "sources": list(self.sources),
-            "pending": self.pending,
+            "pending": [
+                (sequence, torch.from_numpy(gradient)) for sequence, gradient in self.pending
+            ],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -192,9 +194,10 @@ class MetaAdaptation:
         self.standardiser.load_state_dict(state["standardiser"])
         self.beta = state["beta"]
         self.sources = deque(state["sources"])
-        self.pending = list(state["pending"])
+        self.pending = [(sequence, gradient.numpy()) for sequence, gradient in state["pending"]]
 
 
-def alignment(extrinsic: Tensor, intrinsic: Tensor) -> Tensor:
+def alignment(extrinsic: np.ndarray, intrinsic: np.ndarray) -> float:
     """⟨g_E, g_I⟩ / (|g_E| |g_I|), in [-1, 1]; 0 where either is 0."""
-    return nn.functional.cosine_similarity(extrinsic, intrinsic, dim=0)
+    lengths = np.sqrt((extrinsic @ extrinsic) * (intrinsic @ intrinsic))
+    return float(extrinsic @ intrinsic / lengths) if lengths > 0 else 0.0

@@ -75,7 +75,8 @@ class NoveltyConfig(Section):
     """Novelty: visitation counts (Discrete observations) or k-NN and density (Box)."""
 
     count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
-    buffer_size: PositiveInt  # visited states that k-NN and density refer to
+    buffer_size: PositiveInt  # visited states that k-NN and density refer to, the last ones ...
+    write_every: PositiveInt  # ... of every so many
     neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
     density_hidden_units: PositiveInt

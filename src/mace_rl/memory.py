@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from mace_rl.hyperparameters import MemoryConfig
+from mace_rl.nearest import nearest
 
 
 class Recollection(NamedTuple):
@@ -68,13 +69,14 @@ class EpisodicMemory:
         embedded = (queries - mean) / std
         keys = (self.keys[stored] - mean) / std
         neighbours = min(self.config.neighbours, len(stored))
-        with torch.no_grad():
-            distances = torch.cdist(embedded, keys, compute_mode="use_mm_for_euclid_dist")
-            nearest = distances.topk(neighbours, largest=False).indices  # [N, k]
-        squares = (embedded[:, None] - keys[nearest]).square().mean(-1)  # [N, k]
+        places = nearest(
+            embedded.detach().float().numpy(), keys.detach().float().numpy(), neighbours
+        )[1]  # int64 [N, k]; which ones are nearest has no gradient
+        chosen = torch.from_numpy(places)
+        squares = (embedded[:, None] - keys[chosen]).square().mean(-1)  # [N, k]
         kernel = 1 / (squares + self.config.kernel_bandwidth)
         weights = kernel / kernel.sum(1, keepdim=True)
-        read = stored[nearest]
+        read = stored[chosen]
         self.time += 1
         self.usage[read.ravel()] = self.time
         return Recollection(

@@ -4,10 +4,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from mace_rl.density import MADE
 from mace_rl.hyperparameters import NoveltyConfig
+from mace_rl.nearest import nearest
 from mace_rl.standardise import RunningStandardiser
 from mace_rl.streams import numpy_generator, torch_generator
 
@@ -109,8 +109,8 @@ class DensityNovelty:
         """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
         visited = self.embedding(self.visited)
         largest = min(max(self.config.neighbours), len(visited))
-        distances, _ = cKDTree(visited).query(self.embedding(states), k=[*range(1, largest + 1)])
-        distances /= np.sqrt(states.shape[1])
+        squares, _ = nearest(self.embedding(states), visited, largest)
+        distances = np.sqrt(squares / states.shape[1], dtype=np.float64)
         ensemble = [
             1 - np.exp(-distances[:, :neighbours].mean(axis=1))
             for neighbours in self.config.neighbours
@@ -125,10 +125,11 @@ class DensityNovelty:
         return 1 - lower.double().numpy() / len(self.reference)
 
     def observe(self, states: np.ndarray) -> None:
-        """Add an episode's states to the buffer and train the density estimator on it."""
-        places = np.arange(self.seen, self.seen + len(states)) % len(self.buffer)
-        self.buffer[places] = states
-        self.seen += len(states)
+        """Add one in `write_every` of an episode's states and train the density estimator."""
+        chosen = states[:: self.config.write_every]
+        places = np.arange(self.seen, self.seen + len(chosen)) % len(self.buffer)
+        self.buffer[places] = chosen
+        self.seen += len(chosen)
         visited = self.visited
         for _ in range(self.config.density_steps):
             index = self.batches.integers(len(visited), size=self.config.density_batch_size)

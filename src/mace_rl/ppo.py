@@ -1,5 +1,6 @@
 """Proximal Policy Optimization (Schulman et al. 2017) with one critic per kind of reward."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -7,13 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor, nn
 
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import PPOConfig
-from mace_rl.policy import ActingPolicy, Actor, critic
+from mace_rl.network import MLP
+from mace_rl.policy import ActingPolicy, Actor
 from mace_rl.standardise import RunningStandardiser
-from mace_rl.streams import numpy_generator, torch_generator
+from mace_rl.streams import numpy_generator
 
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 
@@ -39,11 +40,62 @@ def advantages(rewards, values, discount, gae_lambda):
 class Batch:
     """What one update learns from: N steps of whole episodes, one after the other."""
 
-    observations: Tensor  # float32 [N, observation], normalised
-    actions: Tensor  # int64 [N] or float32 [N, actions]
-    log_probs: Tensor  # float32 [N], when the actions were taken
-    advantages: Tensor  # float32 [N], of the total reward, normalised
-    returns: dict[str, Tensor]  # for each critic the λ-returns it learns, float32 [N]
+    observations: np.ndarray  # float32 [N, observation], normalised
+    actions: np.ndarray  # int64 [N] or float32 [N, actions]
+    log_probs: np.ndarray  # float32 [N], when the actions were taken
+    advantages: np.ndarray  # float32 [N], of the total reward, normalised
+    returns: dict[str, np.ndarray]  # for each critic the λ-returns it learns, float32 [N]
+
+
+@njit(cache=True)
+def adam(parameters, gradient, mean, square, time, learning_rate):
+    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; all arrays float32 [n].
+
+    mean and square are the moments' running estimates, time counts steps from 1.
+    """
+    decay_mean, decay_square, epsilon = 0.9, 0.999, 1e-5
+    rate = np.float32(learning_rate / (1 - decay_mean**time))
+    scale = np.float32(1 / math.sqrt(1 - decay_square**time))
+    keep_mean, keep_square = np.float32(decay_mean), np.float32(decay_square)
+    add_mean, add_square = np.float32(1 - decay_mean), np.float32(1 - decay_square)
+    for i in range(len(parameters)):
+        mean[i] = keep_mean * mean[i] + add_mean * gradient[i]
+        square[i] = keep_square * square[i] + add_square * gradient[i] * gradient[i]
+        parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(epsilon))
+
+
+class Learner:
+    """Adam on a network's parameters, with the gradient clipped by its norm."""
+
+    def __init__(self, network: MLP, learning_rate: float, max_gradient_norm: float) -> None:
+        self.parameters = network.parameters
+        self.learning_rate = learning_rate
+        self.max_gradient_norm = max_gradient_norm
+        self.mean, self.square = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
+        self.time = 0
+
+    def descend(self, gradient: np.ndarray) -> float:
+        """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
+        norm = float(np.sqrt(gradient @ gradient))
+        if norm > self.max_gradient_norm:
+            gradient = gradient * np.float32(self.max_gradient_norm / norm)
+        self.time += 1
+        adam(self.parameters, gradient, self.mean, self.square, self.time, self.learning_rate)
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters and the optimiser's moments."""
+        arrays = {"parameters": self.parameters, "mean": self.mean, "square": self.square}
+        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()} | {
+            "time": self.time
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned, in place: the network holds the same arrays."""
+        self.parameters[:] = state["parameters"].numpy()
+        self.mean[:] = state["mean"].numpy()
+        self.square[:] = state["square"].numpy()
+        self.time = state["time"]
 
 
 class PPO:
@@ -58,41 +110,36 @@ class PPO:
         self, config: PPOConfig, environment: Environment, seed: int, intrinsic: bool
     ) -> None:
         self.config = config
-        size, hidden = environment.observation_size, config.hidden_units
+        size = environment.observation_size
         self.actor = Actor(
             size,
             environment.action_space,
-            hidden,
+            config.hidden_units,
             config.initial_log_std,
-            torch_generator(seed, "actor"),
+            numpy_generator(seed, "actor"),
         )
         kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
-        self.critics = nn.ModuleDict(
-            {kind: critic(size, hidden, torch_generator(seed, f"{kind}_critic")) for kind in kinds}
-        )
-        self.optimisers = {
-            "actor": torch.optim.Adam(
-                self.actor.parameters(), config.actor_learning_rate, eps=1e-5, fused=True
-            )
+        self.critics = {
+            kind: MLP([size, *config.hidden_units, 1], 1.0, numpy_generator(seed, f"{kind}_critic"))
+            for kind in kinds
+        }
+        self.learners = {
+            "actor": Learner(self.actor, config.actor_learning_rate, config.max_gradient_norm)
         } | {
-            kind: torch.optim.Adam(
-                network.parameters(), config.critic_learning_rate, eps=1e-5, fused=True
-            )
+            kind: Learner(network, config.critic_learning_rate, config.max_gradient_norm)
             for kind, network in self.critics.items()
         }
         self.standardiser = RunningStandardiser(size)
         self.minibatches = numpy_generator(seed, "minibatches")
 
-    def normalise(self, observations: np.ndarray) -> Tensor:
+    def normalise(self, observations: np.ndarray) -> np.ndarray:
         """What the networks see of `observations`, float32 [N, observation]."""
-        if self.config.normalise_observations:
-            observations = np.clip(
-                self.standardiser(observations), -OBSERVATION_CLIP, OBSERVATION_CLIP
-            )
-        return torch.from_numpy(observations)
+        if not self.config.normalise_observations:
+            return observations
+        return np.clip(self.standardiser(observations), -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
     def acting_policy(self) -> ActingPolicy:
-        """A copy of the current policy for a rollout."""
+        """The current policy for a rollout."""
         if self.config.normalise_observations:
             return self.actor.for_acting(
                 self.standardiser.mean, self.standardiser.std, OBSERVATION_CLIP
@@ -100,55 +147,58 @@ class PPO:
         size = len(self.standardiser.mean)
         return self.actor.for_acting(np.zeros(size), np.ones(size), np.inf)
 
-    @torch.no_grad()
     def advantages_and_returns(
-        self, kind: str, observations: Tensor, rewards: np.ndarray, terminated: bool
+        self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
         observations: normalised, [T + 1, observation]. A terminal state is worth 0; a state the
         time limit cut off at is worth what the critic says.
         """
-        values = self.critics[kind](observations).squeeze(1).double().numpy()
+        values = self.critics[kind].forward(observations)[-1][:, 0].astype(np.float64)
         if terminated:
             values[-1] = 0.0
         result = advantages(rewards, values, self.config.discount, self.config.gae_lambda)
         return result, result + values[:-1]
 
     def update(self, batch: Batch) -> dict[str, float]:
-        """K epochs over `batch`; returns the last losses and gradient norms by name."""
-        losses: dict[str, Tensor] = {}
-        norms: dict[str, Tensor] = {}
+        """K epochs over `batch`; returns the last gradient norms by name."""
+        norms: dict[str, float] = {}
         for index in self._minibatches(len(batch.log_probs)):
             observations = batch.observations[index]
-            losses = {"actor": self._actor_loss(batch, index)} | {
-                kind: nn.functional.mse_loss(
-                    self.critics[kind](observations).squeeze(1), returns[index]
+            norms["actor"] = self.learners["actor"].descend(self.actor_gradient(batch, index))
+            for kind, returns in batch.returns.items():
+                norms[kind] = self.learners[kind].descend(
+                    value_gradient(self.critics[kind], observations, returns[index])
                 )
-                for kind, returns in batch.returns.items()
-            }
-            for optimiser in self.optimisers.values():
-                optimiser.zero_grad()
-            torch.stack(list(losses.values())).sum().backward()
-            for name, optimiser in self.optimisers.items():
-                norms[name] = nn.utils.clip_grad_norm_(
-                    optimiser.param_groups[0]["params"], self.config.max_gradient_norm
-                )
-                optimiser.step()
-        return {f"the {name}'s loss": loss.item() for name, loss in losses.items()} | {
-            f"the {name}'s gradient norm": norm.item() for name, norm in norms.items()
-        }
+        return norms
 
-    def _actor_loss(self, batch: Batch, index: Any) -> Tensor:
-        """The clipped surrogate with an entropy bonus, negated (Schulman et al. 2017, eq. 7)."""
-        log_probs, entropy = self.actor.log_prob_and_entropy(
-            batch.observations[index], batch.actions[index]
+    def actor_gradient(self, batch: Batch, index: Any = slice(None)) -> np.ndarray:
+        """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
+
+        `index` chooses the steps of a minibatch. The surrogate min(rA, clip(r)A), with ratio r, is
+        flat where the ratio is already past the bound that the advantage pushes it to; elsewhere
+        its gradient is r A ∇log π.
+        """
+        actions, advantage = batch.actions[index], batch.advantages[index]
+        activations = self.actor.forward(batch.observations[index])
+        ratio = np.exp(self.actor.log_probs(activations[-1], actions) - batch.log_probs[index])
+        clip = self.config.clip
+        flat = np.where(advantage > 0, ratio > 1 + clip, ratio < 1 - clip)
+        count = len(advantage)
+        return -self.actor.gradient(
+            activations,
+            actions,
+            np.where(flat, 0, ratio * advantage / count).astype(np.float32),
+            self.config.entropy_coefficient / count,
         )
-        ratio = torch.exp(log_probs - batch.log_probs[index])
-        clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
-        advantage = batch.advantages[index]
-        surrogate = torch.minimum(ratio * advantage, clipped * advantage).mean()
-        return -surrogate - self.config.entropy_coefficient * entropy.mean()
+
+    def policy_gradient(
+        self, observations: np.ndarray, actions: np.ndarray, advantage: np.ndarray
+    ) -> np.ndarray:
+        """∇_θ of the mean of log π(a|s) · A, float32 [n]; advantage: float32 [N]."""
+        weights = advantage / np.float32(len(advantage))
+        return self.actor.gradient(self.actor.forward(observations), actions, weights)
 
     def _minibatches(self, size: int) -> Iterator[Any]:
         """Indices of each minibatch of each epoch; the whole batch in order if none are asked."""
@@ -156,31 +206,28 @@ class PPO:
             if self.config.minibatch_size is None:
                 yield slice(None)
             else:
-                order = torch.from_numpy(self.minibatches.permutation(size))
-                yield from order.split(self.config.minibatch_size)
-
-    def policy_gradient(self, log_probs: Tensor, advantages: Tensor) -> Tensor:
-        """∇_θ mean(log π(a|s) · A) as one flat vector; `log_probs` carries the graph."""
-        gradients = torch.autograd.grad(
-            (log_probs * advantages).mean(), list(self.actor.parameters()), retain_graph=True
-        )
-        return torch.cat([gradient.ravel() for gradient in gradients])
+                order = self.minibatches.permutation(size)
+                for start in range(0, size, self.config.minibatch_size):
+                    yield order[start : start + self.config.minibatch_size]
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, normaliser and generator."""
         return {
-            "actor": self.actor.state_dict(),
-            "critics": self.critics.state_dict(),
-            "optimisers": {name: item.state_dict() for name, item in self.optimisers.items()},
+            "learners": {name: learner.state_dict() for name, learner in self.learners.items()},
             "standardiser": self.standardiser.state_dict(),
             "minibatches": self.minibatches.bit_generator.state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.actor.load_state_dict(state["actor"])
-        self.critics.load_state_dict(state["critics"])
-        for name, item in self.optimisers.items():
-            item.load_state_dict(state["optimisers"][name])
+        for name, learner in self.learners.items():
+            learner.load_state_dict(state["learners"][name])
         self.standardiser.load_state_dict(state["standardiser"])
         self.minibatches.bit_generator.state = state["minibatches"]
+
+
+def value_gradient(critic: MLP, observations: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """Gradient of the mean squared error of V(s) against `returns`, [N]; float32 [n]."""
+    activations = critic.forward(observations)
+    errors = activations[-1] - returns[:, None]
+    return critic.backward(activations, errors * np.float32(2 / len(returns)))

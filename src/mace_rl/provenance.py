@@ -10,32 +10,6 @@ from typing import Any
 
 PACKAGE = Path(__file__).parent
 
-# The modules that a run's results depend on: a change in any of them retrains.
-TRAINING_MODULES = (
-    "__init__",
-    "beta",
-    "checkpoint",
-    "compiled",
-    "curiosity",
-    "density",
-    "environments",
-    "finite",
-    "hopper",
-    "hyperparameters",
-    "memory",
-    "novelty",
-    "policy",
-    "ppo",
-    "provenance",
-    "records",
-    "rollout",
-    "run",
-    "standardise",
-    "streams",
-    "train",
-)
-TRAINING_SOURCES = tuple(PACKAGE / f"{name}.py" for name in TRAINING_MODULES)
-
 # The packages whose version can change a result.
 PACKAGES = (
     "torch",
@@ -52,12 +26,6 @@ PACKAGES = (
 def file_digest(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def source_digest() -> str:
-    """SHA-256 over the training sources, names included."""
-    lines = [f"{path.name} {file_digest(path)}\n" for path in TRAINING_SOURCES]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:

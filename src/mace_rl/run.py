@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
-from mace_rl import checkpoint, provenance
+from mace_rl import checkpoint, provenance, sources
 from mace_rl.hyperparameters import RunConfig
 from mace_rl.records import write_atomically, write_episodes
 from mace_rl.train import Record, Trainer
@@ -47,7 +48,7 @@ def run(config: RunConfig, directory: Path) -> None:
     """
     torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
-    with exclusive(directory):
+    with exclusive(directory), threadpool_limits(1):
         started = time.monotonic()
         trainer = Trainer(config)
         identity = run_identity(config)
@@ -77,7 +78,7 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
     return {
         "config": config.model_dump(),
         "versions": provenance.versions(),
-        "sources": provenance.source_digest(),
+        "sources": sources.digest(sources.PACKAGE / "run.py"),
     }
 
 

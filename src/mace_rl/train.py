@@ -43,7 +43,7 @@ class Experience:
     """An episode with all that the update needs of it; arrays are [T]."""
 
     episode: Episode
-    observations: torch.Tensor  # float32 [T + 1, observation], normalised as the networks see them
+    observations: np.ndarray  # float32 [T + 1, observation], normalised as the networks see them
     beta: float
     bonus: np.ndarray  # R_curiosity
     extrinsic_advantages: np.ndarray
@@ -143,50 +143,56 @@ class Trainer:
         """
         if not (self.controller and self.controller.learns):
             return
-        log_probs, _ = self.ppo.actor.log_prob_and_entropy(
-            torch.cat([item.observations[:-1] for item in rollout]),
-            torch.from_numpy(np.concatenate([item.episode.actions for item in rollout])),
-        )
         extrinsic = centred([item.extrinsic_advantages for item in rollout])
         intrinsic = centred([item.intrinsic_advantages for item in rollout])
-        lengths = [len(item.episode) for item in rollout]
         self.controller.learn(
-            self.ppo.policy_gradient(log_probs, extrinsic),
+            self.ppo.policy_gradient(*steps(rollout), np.concatenate(extrinsic)),
             [
-                self.ppo.policy_gradient(*episode)
-                for episode in zip(log_probs.split(lengths), intrinsic.split(lengths), strict=True)
+                self.ppo.policy_gradient(*steps([item]), advantages)
+                for item, advantages in zip(rollout, intrinsic, strict=True)
             ],
         )
 
     def improve(self, rollout: list[Experience]) -> None:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        total = centred(
-            [item.extrinsic_advantages + item.beta * item.intrinsic_advantages for item in rollout]
+        total = np.concatenate(
+            centred(
+                [
+                    item.extrinsic_advantages + item.beta * item.intrinsic_advantages
+                    for item in rollout
+                ]
+            )
         )
-        returns = {"extrinsic": as_tensor([item.extrinsic_returns for item in rollout])}
+        returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
         if self.curiosity:
-            returns["intrinsic"] = as_tensor([item.intrinsic_returns for item in rollout])
-        outcome = self.ppo.update(
+            returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
+        norms = self.ppo.update(
             Batch(
-                observations=torch.cat([item.observations[:-1] for item in rollout]),
-                actions=torch.from_numpy(
-                    np.concatenate([item.episode.actions for item in rollout])
-                ),
-                log_probs=as_tensor([item.episode.log_probs for item in rollout]),
-                advantages=total / (total.std(correction=0) + 1e-8),
+                *steps(rollout),
+                log_probs=joined([item.episode.log_probs for item in rollout]),
+                advantages=total / (total.std() + np.float32(1e-8)),
                 returns=returns,
             )
         )
-        # NaN or Inf in any epoch spreads to the weights and so to the last epoch's figures.
-        for name, value in outcome.items():
-            require_finite(name, value)
+        # NaN or Inf in any epoch spreads to the weights and so to the last epoch's gradient.
+        for name, norm in norms.items():
+            require_finite(f"the {name}'s gradient norm", norm)
         for item in rollout:
             self.ppo.standardiser.update(item.episode.observations[:-1])
 
     def agent(self) -> dict[str, Any]:
         """The policy and critics as they are now, with the observation normaliser."""
-        state = self.ppo.state_dict()
-        return {name: state[name] for name in ("actor", "critics", "standardiser")}
+        networks = {"actor": self.ppo.actor} | self.ppo.critics
+        return {
+            "networks": {
+                name: {
+                    "sizes": network.sizes.tolist(),
+                    "parameters": torch.from_numpy(network.parameters.copy()),
+                }
+                for name, network in networks.items()
+            },
+            "standardiser": self.ppo.standardiser.state_dict(),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the rest of the run depends on, at the end of a round."""
@@ -220,12 +226,18 @@ class Trainer:
         ]
 
 
-def as_tensor(pieces: list[np.ndarray]) -> torch.Tensor:
+def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
+    """Observations, [N, observation], and actions of the episodes, one after the other."""
+    observations = np.concatenate([item.observations[:-1] for item in rollout])
+    return observations, np.concatenate([item.episode.actions for item in rollout])
+
+
+def joined(pieces: list[np.ndarray]) -> np.ndarray:
     """The episodes' arrays one after the other, float32 [N]."""
-    return torch.from_numpy(np.concatenate(pieces).astype(np.float32))
+    return np.concatenate(pieces).astype(np.float32)
 
 
-def centred(advantages: list[np.ndarray]) -> torch.Tensor:
-    """The episodes' advantages minus their common mean, float32 [N]."""
-    joined = np.concatenate(advantages)
-    return torch.from_numpy((joined - joined.mean()).astype(np.float32))
+def centred(advantages: list[np.ndarray]) -> list[np.ndarray]:
+    """The episodes' advantages minus their common mean, float32 [T] each."""
+    mean = np.concatenate(advantages).mean()
+    return [(item - mean).astype(np.float32) for item in advantages]
