@@ -6,28 +6,16 @@ it belongs to (configuration, code, versions); one of another identity is never 
 
 import hashlib
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mace_rl.files import write_atomically
+
 
 class CheckpointError(ValueError):
     """A file that is damaged or belongs to another run; the message names it and says why."""
-
-
-def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Replace `path` by `content` so that a crash leaves the old file or the new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def archive(content: dict[str, Any]) -> bytes:
@@ -52,7 +40,7 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
 def save(path: Path, identity: dict[str, Any], state: dict[str, Any]) -> None:
     """Write a checkpoint of the run with this `identity`."""
     data = archive({"identity": identity, "state": state})
-    write_bytes_atomically(path, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+    write_atomically(path, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
 
 
 def load(path: Path, identity: dict[str, Any]) -> dict[str, Any]:

@@ -23,8 +23,9 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from mace_rl import checkpoint, provenance, sources
+from mace_rl.files import write_atomically
 from mace_rl.hyperparameters import RunConfig
-from mace_rl.records import write_atomically, write_episodes
+from mace_rl.records import write_episodes
 from mace_rl.train import Record, Trainer
 
 logger = logging.getLogger(__name__)
@@ -176,7 +177,7 @@ def write_results(
         },
     )
     agent = checkpoint.archive(trainer.agent())
-    checkpoint.write_bytes_atomically(directory / "agent.pt", agent)
+    write_atomically(directory / "agent.pt", agent)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux
     origin = identity | {
         "code": provenance.git_state(),

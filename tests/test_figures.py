@@ -1,0 +1,254 @@
+"""Figure 1: its data against pandas and scipy, and what is drawn against its data."""
+
+import math
+import struct
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+from matplotlib.colors import same_color
+
+from mace_rl.figures import FigureConfig, figure1, learning_curves, save_figure, seed_curves
+from mace_rl.hyperparameters import ConfigError, check
+from mace_rl.metrics import MetricsConfig
+from mace_rl.records import RecordError
+
+METRICS = MetricsConfig(
+    final_fraction=0.1,
+    threshold=0.75,
+    moving_average=5,
+    convergence_band=0.1,
+    confidence=0.95,
+    bootstrap_repetitions=500,
+    bootstrap_seed=0,
+    random_return={},
+)
+LABELS = {"ppo": "PPO (Baseline)", "mace_full": "MACE-RL (Full β)"}
+COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
+
+
+def frames(environments=("A-v0", "B-v1"), seeds=3, episodes=40):
+    draws = np.random.default_rng(0)
+    return {
+        run: pd.DataFrame({"extrinsic_return": np.cumsum(draws.normal(size=episodes))})
+        for run in product(environments, LABELS, range(seeds))
+    }
+
+
+def data(**shape):
+    single = seed_curves(frames(**shape), METRICS.moving_average)
+    return learning_curves(single, METRICS), single
+
+
+def draw(columns=3, colours=COLOURS, **shape):
+    return figure1(*data(**shape), FigureConfig(columns=columns), METRICS, LABELS, colours)
+
+
+def at(frame, **values):
+    for name, value in values.items():
+        frame = frame[frame[name] == value]
+    return frame
+
+
+def test_a_seeds_curve_is_the_moving_average_of_the_episodes_so_far():
+    runs = frames()
+    single = seed_curves(runs, 5)
+    assert list(single.columns) == ["env", "variant", "seed", "episode", "moving_average"]
+    for (environment, variant, seed), run in runs.items():
+        curve = at(single, env=environment, variant=variant, seed=seed)
+        assert curve["episode"].tolist() == list(range(1, 41))
+        expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
+        np.testing.assert_allclose(curve["moving_average"], expected)
+
+
+@pytest.mark.parametrize("episodes", [1, 4, 5, 6])
+def test_runs_about_as_long_as_the_window(episodes):
+    run = frames(episodes=episodes)["A-v0", "ppo", 0]
+    curve = seed_curves({("A-v0", "ppo", 0): run}, 5)
+    expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
+    np.testing.assert_allclose(curve["moving_average"], expected)
+
+
+@pytest.mark.parametrize(("episodes", "points"), [(1000, 1000), (1001, 501), (6000, 1000)])
+def test_long_curves_are_thinned_and_end_at_the_last_episode(episodes, points):
+    run = frames(("A-v0",), 1, episodes)["A-v0", "ppo", 0]
+    curve = seed_curves({("A-v0", "ppo", 0): run}, 5)
+    assert len(curve) == points
+    assert curve["episode"].iloc[-1] == episodes
+    assert set(np.diff(curve["episode"])) == {math.ceil(episodes / 1000)}
+    full = run["extrinsic_return"].rolling(5, min_periods=1).mean().to_numpy()
+    np.testing.assert_allclose(curve["moving_average"], full[curve["episode"] - 1])
+
+
+def test_learning_curves_against_scipy_point_by_point():
+    curves, single = data(seeds=4)
+    assert list(curves.columns) == ["env", "variant", "episode", "mean", "lower", "upper", "n"]
+    assert len(curves) == 2 * 2 * 40
+    for row in curves.iloc[::7].itertuples():
+        values = at(single, env=row.env, variant=row.variant, episode=row.episode)["moving_average"]
+        assert len(values) == row.n == 4
+        assert row.mean == pytest.approx(values.mean())
+        bounds = scipy.stats.t.interval(0.95, 3, values.mean(), values.sem())
+        assert (row.lower, row.upper) == pytest.approx(bounds)
+
+
+def test_from_ten_seeds_on_the_band_is_the_same_bootstrap_every_time():
+    curves, _ = data(seeds=10)
+    again, _ = data(seeds=10)
+    pd.testing.assert_frame_equal(curves, again, check_exact=True)
+    assert (curves["lower"] < curves["mean"]).all()
+    assert (curves["mean"] < curves["upper"]).all()
+
+
+def test_one_seed_has_a_mean_and_no_band():
+    curves, single = data(seeds=1)
+    assert curves["lower"].isna().all()
+    assert curves["upper"].isna().all()
+    np.testing.assert_array_equal(curves["mean"], single["moving_average"])
+
+
+def test_seeds_of_different_lengths_are_refused():
+    runs = frames()
+    runs["B-v1", "ppo", 1] = runs["B-v1", "ppo", 1].iloc[:-1]
+    with pytest.raises(RecordError, match="the seeds of B-v1, ppo differ in their episodes"):
+        learning_curves(seed_curves(runs, 5), METRICS)
+
+
+def test_the_data_comes_back_from_csv_to_the_bit(tmp_path):
+    for written in data():
+        written.to_csv(tmp_path / "data.csv", index=False)
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "data.csv"), written, check_exact=True)
+
+
+def test_one_panel_per_environment_shows_the_data():
+    curves, _ = data()
+    figure = draw()
+    assert [axes.get_title() for axes in figure.axes] == ["A-v0", "B-v1"]
+    assert figure.axes[0].get_ylabel() == "Extrinsic return\n(mean of 5 episodes)"
+    assert {axes.get_xlabel() for axes in figure.axes} == {"Training episodes"}
+    for axes in figure.axes:
+        means = [line for line in axes.get_lines() if line.get_label() in LABELS.values()]
+        assert [line.get_label() for line in means] == list(LABELS.values())
+        for line, variant in zip(means, LABELS, strict=True):
+            curve = at(curves, env=axes.get_title(), variant=variant)
+            np.testing.assert_array_equal(line.get_xdata(), curve["episode"])
+            np.testing.assert_array_equal(line.get_ydata(), curve["mean"])
+            assert same_color(line.get_color(), COLOURS[variant])
+
+
+def test_bands_and_faint_seeds_lie_behind_the_means():
+    axes = draw(seeds=4).axes[0]
+    faint = [line for line in axes.get_lines() if line.get_label() not in LABELS.values()]
+    means = [line for line in axes.get_lines() if line.get_label() in LABELS.values()]
+    bands = axes.collections
+    assert len(faint) == 2 * 4
+    assert len(bands) == 2
+    assert max(line.get_alpha() for line in faint) < 0.5
+    assert max(line.zorder for line in faint) < min(band.zorder for band in bands)
+    assert max(band.zorder for band in bands) < min(line.zorder for line in means)
+    curves, single = data(seeds=4)
+    vertices = bands[0].get_paths()[0].vertices
+    curve = at(curves, env="A-v0", variant="ppo")
+    assert vertices[:, 1].max() == curve["upper"].max()
+    assert vertices[:, 1].min() == curve["lower"].min()
+    shown = at(single, env="A-v0")["moving_average"]
+    low, high = axes.get_ylim()
+    assert low < shown.min()
+    assert high > shown.max()
+
+
+@pytest.mark.parametrize(("seeds", "bands", "faint"), [(1, 0, 0), (2, 0, 4), (3, 2, 6)])
+def test_few_seeds(seeds, bands, faint):
+    figure = draw(seeds=seeds)
+    assert len(figure.axes[0].collections) == bands
+    assert len(figure.axes[0].get_lines()) == 2 + faint
+    (legend,) = figure.legends
+    assert ("95 % interval" in legend.get_title().get_text()) == (bands > 0)
+
+
+def test_the_legend_stands_once_and_names_every_variant():
+    figure = draw()
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == list(LABELS.values())
+    assert "3 seeds" in legend.get_title().get_text()
+    assert all(axes.get_legend() is None for axes in figure.axes)
+
+
+@pytest.mark.parametrize(("environments", "columns"), [(1, 3), (2, 1), (4, 3), (5, 2), (7, 3)])
+def test_any_number_of_environments(environments, columns, tmp_path):
+    names = tuple(f"E{i}-v0" for i in range(environments))
+    figure = draw(columns, environments=names, seeds=2)
+    assert [axes.get_title() for axes in figure.axes] == list(names)
+    bottom = [axes.get_title() for axes in figure.axes if axes.get_xlabel()]
+    assert bottom == list(names[-min(columns, environments) :])
+    left = [axes.get_title() for axes in figure.axes if axes.get_ylabel()]
+    assert left == list(names[:: min(columns, environments)])
+    save_figure(figure, tmp_path / "figure.png")
+
+
+def test_a_constant_return_can_be_drawn(tmp_path):
+    runs = {run: frame * 0 + 500 for run, frame in frames(seeds=3).items()}
+    single = seed_curves(runs, 5)
+    figure = figure1(
+        learning_curves(single, METRICS), single, FigureConfig(columns=3), METRICS, LABELS, COLOURS
+    )
+    save_figure(figure, tmp_path / "figure.pdf")
+
+
+def test_the_same_data_gives_the_same_files_and_another_colour_does_not(tmp_path, monkeypatch):
+    for name, epoch, colours in (
+        ("a", "0", COLOURS),
+        ("b", "1000000000", COLOURS),
+        ("c", "0", COLOURS | {"ppo": "#123456"}),
+    ):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)  # what matplotlib would take for the time
+        for kind in ("pdf", "png"):
+            save_figure(draw(colours=colours), tmp_path / f"{name}.{kind}")
+    for kind in ("pdf", "png"):
+        first, second, third = ((tmp_path / f"{name}.{kind}").read_bytes() for name in "abc")
+        assert first == second
+        assert first != third
+
+
+def test_the_pdf_has_vectors_truetype_fonts_and_no_date(tmp_path):
+    save_figure(draw(), tmp_path / "figure.pdf")
+    content = (tmp_path / "figure.pdf").read_bytes()
+    assert b"/FontFile2" in content
+    assert b"/Type3" not in content
+    assert b"/Subtype /Image" not in content
+    assert b"CreationDate" not in content
+    assert b"matplotlib" not in content.lower()
+
+
+def test_the_png_has_a_printers_resolution(tmp_path):
+    save_figure(draw(), tmp_path / "figure.png")
+    content = (tmp_path / "figure.png").read_bytes()
+    place = content.index(b"pHYs") + 4
+    per_metre, _, unit = struct.unpack(">IIB", content[place : place + 9])
+    assert unit == 1
+    assert per_metre * 0.0254 >= 200
+    assert b"Software" not in content
+
+
+@pytest.mark.parametrize("columns", [0, -1, 1.5, "3", None])
+def test_columns_are_a_positive_number(columns):
+    with pytest.raises(ConfigError, match="figure: columns is"):
+        check(FigureConfig, {"columns": columns}, "figure")
+
+
+def test_importing_results_modules_is_quick():
+    """Planning the workflow imports them; tables and figures do without torch altogether."""
+    heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}
+    slow = heavy | {"pandas", "matplotlib.figure", "seaborn", "scipy.stats"}
+    code = (
+        "import sys; import mace_rl.{}; from mace_rl import records, metrics, statistics, figures;"
+        "print(*(set({}) & set(sys.modules)))"
+    )
+    for module, forbidden in (("figures", slow), ("tables", heavy)):
+        command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
+        run = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert run.stdout.split() == []

@@ -1,0 +1,386 @@
+"""Metrics on curves whose answers are known by hand, and against plain loops."""
+
+from decimal import ROUND_CEILING, Decimal
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mace_rl import metrics as m
+from mace_rl.hyperparameters import ConfigError, check
+from mace_rl.records import RecordError
+
+SETTINGS = {
+    "final_fraction": 0.1,
+    "threshold": 0.75,
+    "moving_average": 50,
+    "convergence_band": 0.1,
+    "confidence": 0.95,
+    "bootstrap_repetitions": 1000,
+    "bootstrap_seed": 0,
+    "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
+}
+CONFIG = check(m.MetricsConfig, SETTINGS, "test")
+ENVIRONMENTS, VARIANTS, SEEDS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_full"], [3, 1]
+
+
+def ramp(flat_before, rise, flat_after):
+    """0, …, 0, 1, 2, …, rise, rise, …"""
+    return np.concatenate(
+        [np.zeros(flat_before), np.arange(1.0, rise + 1), np.full(flat_after, float(rise))]
+    )
+
+
+def noisy(seed, episodes=400):
+    """A learning curve with noise, rounded so that equal values occur."""
+    generator = np.random.default_rng(seed)
+    level = 100 / (1 + np.exp(-(np.arange(episodes) - generator.integers(50, 300)) / 20))
+    return np.round(level + generator.normal(size=episodes) * 10)
+
+
+def averages(returns, window):
+    """Moving averages by episode number (from 1), from pandas."""
+    rolling = pd.Series(returns).rolling(window).mean()
+    return {t + 1: value for t, value in enumerate(rolling) if not np.isnan(value)}
+
+
+def frame(returns, length=1):
+    episodes = np.arange(1, len(returns) + 1)
+    return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
+
+
+# final return
+
+
+def test_final_return_by_hand():
+    assert m.final_return(np.arange(20.0), 0.1) == 18.5  # of 18 and 19
+    assert m.final_return(np.arange(2000.0), 0.1) == np.mean(range(1800, 2000))
+    assert m.final_return(np.array([1.0, 5.0]), 0.1) == 5
+    assert m.final_return(np.array([1.0, 5.0]), 1.0) == 3
+
+
+@pytest.mark.parametrize("fraction", ["0.1", "0.07"])
+def test_the_last_part_is_rounded_up_in_decimal(fraction):
+    """In doubles, 0.07 · 100 is 7.000000000000001, which would round up to 8 episodes."""
+    for episodes in range(1, 101):
+        last = int((Decimal(fraction) * episodes).to_integral_value(ROUND_CEILING))
+        returns = 2.0 ** -np.arange(episodes)
+        assert m.final_return(returns, float(fraction)) == np.mean(returns[episodes - last :])
+
+
+# the paper's sample efficiency
+
+
+def test_sample_efficiency_is_the_first_single_episode():
+    returns = np.array([0, 10, 75, 20, 74, 100, 100, 100, 100, 100.0])
+    assert m.sample_efficiency(returns, 0.75, final=100) == (3, False)
+    assert m.sample_efficiency(returns, 0.751, final=100) == (6, False)
+
+
+def test_sample_efficiency_bar_of_negative_returns_lies_above_the_final_return():
+    returns = np.array([-500.0, -200.0, *[-85.0] * 18])
+    assert m.sample_efficiency(returns, 0.75, final=-85) == (20, True)  # the bar is -63.75
+    returns[4] = -63.75
+    assert m.sample_efficiency(returns, 0.75, final=-85) == (5, False)
+
+
+def test_reaching_the_bar_in_the_last_episode_is_not_censored():
+    assert m.sample_efficiency(np.array([0.0, 0.0, 1.0]), 0.75, final=1) == (3, False)
+
+
+# the paper's convergence
+
+
+def test_convergence_where_a_ramp_has_left_both_windows():
+    # Flat from episode 300 on: both windows of 50 are flat at episode 300 + 99.
+    assert m.convergence_steps(ramp(0, 300, 1700), 50) == (399, False)
+
+
+def test_convergence_is_not_the_flat_start():
+    # 200 + 100 episodes, then flat: convergence at 300 + 99; the literal reading takes the start.
+    curve = ramp(200, 100, 1000)
+    assert m.convergence_steps(curve, 50) == (399, False)
+    assert m.convergence_steps_flattest(curve, 50) == (100, False)
+
+
+def test_convergence_at_the_first_peak_after_the_steepest_rise():
+    # Window 2: averages of pairs, slopes (m_t - m_{t-2}) / 2 for t = 4, 5, …
+    returns = np.array([0, 0, 1, 1, 9, 9, 10, 8, 8, 9.0])
+    averages_by_hand = [0, 0.5, 1, 5, 9, 9.5, 9, 8, 8.5]  # t = 2, …, 10
+    slopes_by_hand = [0.5, 2.25, 4, 2.25, 0, -0.75, -0.25]  # t = 4, …, 10
+    assert m.moving_average(returns, 2).tolist() == averages_by_hand
+    assert m.slope(returns, 2).tolist() == slopes_by_hand
+    assert m.convergence_steps(returns, 2) == (8, False)
+    assert m.convergence_steps_flattest(returns, 2) == (8, False)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_convergence_against_loops(seed):
+    returns, window = noisy(seed), 25
+    average = averages(returns, window)
+    slopes = {t: average[t] - average[t - window] for t in average if t - window in average}
+    slopes = {t: round(value, 9) for t, value in slopes.items()}
+    steepest = max(slopes, key=lambda t: (slopes[t], -t))
+    expected = next((t for t in slopes if t >= steepest and slopes[t] <= 0), None)
+    assert m.convergence_steps(returns, window) == (expected or 400, expected is None)
+    flattest = min(slopes, key=lambda t: (abs(slopes[t]), t))
+    assert m.convergence_steps_flattest(returns, window) == (flattest, False)
+
+
+@pytest.mark.parametrize(
+    "returns",
+    [
+        np.full(300, 0.1),
+        np.arange(300.0)[::-1],
+        np.arange(300.0),
+        np.arange(99.0),
+        np.arange(49.0),
+        np.ones(1),
+    ],
+    ids=["constant", "falling", "rising throughout", "two windows short", "one short", "one"],
+)
+def test_convergence_that_never_comes_is_censored(returns):
+    assert m.convergence_steps(returns, 50) == (len(returns), True)
+
+
+def test_flattest_needs_two_windows():
+    assert m.convergence_steps_flattest(np.ones(99), 50) == (99, True)
+    assert m.convergence_steps_flattest(np.ones(100), 50) == (100, False)
+
+
+# the public code's convergence
+
+
+def test_public_code_never_reports_less_than_its_floor():
+    assert m.convergence_steps_public_code(np.ones(2000)) == (586, False)
+    assert m.convergence_steps_public_code(np.ones(6000)) == (1786, False)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_public_code_against_a_loop(seed):
+    returns = noisy(seed, 1000) * (1 + seed % 3)
+    average = np.convolve(returns, np.ones(50) / 50, "valid")
+    expected = (1000, True)
+    for i in range(int(0.3 * len(average)), len(average) - 50):
+        if abs(average[i + 50] - average[i]) / 50 < 0.05:
+            expected = (i + 1, False)
+            break
+    assert m.convergence_steps_public_code(returns) == expected
+
+
+def test_public_code_is_censored_while_the_return_changes():
+    assert m.convergence_steps_public_code(np.arange(2000.0)) == (2000, True)
+    assert m.convergence_steps_public_code(0.049 * np.arange(2000.0)) == (586, False)
+    assert m.convergence_steps_public_code(np.ones(60)) == (60, True)
+
+
+# the companions
+
+
+def test_range_bar_of_negative_returns():
+    # From -500 to -100 with random -500: the bar is -200, 75 % of the way. Window 10: the average
+    # of k episodes at -100 and 10 - k at -500 is -500 + 40 k, so 8 of them reach it (-180).
+    returns = np.array([-500.0] * 30 + [-100.0] * 70)
+    assert m.sample_efficiency_range(returns, 0.75, -100, 10, -500) == (38, False)
+    # Within 10 % of 400 of the final return, so at -140 or above: 9 of 10 episodes (-140).
+    assert m.convergence_steps_range(returns, 0.1, -100, 10, -500) == (39, False)
+
+
+def test_one_lucky_episode_does_not_reach_the_range_bar():
+    returns = np.array([0.0] * 20 + [100.0] + [0.0] * 29 + [100.0] * 50)
+    assert m.sample_efficiency(returns, 0.75, 100) == (21, False)
+    assert m.sample_efficiency_range(returns, 0.75, 100, 10, 0) == (58, False)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_range_metrics_against_loops(seed):
+    returns, window, random_mean = noisy(seed), 25, -3.0
+    final = m.final_return(returns, 0.1)
+    average = averages(returns, window)
+    bar = random_mean + 0.75 * (final - random_mean)
+    reached = next((t for t in average if average[t] >= bar), None)
+    observed = m.sample_efficiency_range(returns, 0.75, final, window, random_mean)
+    assert observed == (reached or 400, reached is None)
+    near = [t for t in average if abs(average[t] - final) <= 0.1 * (final - random_mean)]
+    settled = [t for t in near if set(range(t, 401)) <= set(near)]
+    observed = m.convergence_steps_range(returns, 0.1, final, window, random_mean)
+    assert observed == ((min(settled), False) if settled else (400, True))
+
+
+def test_a_collapse_delays_the_convergence_without_floor():
+    returns = np.array([0.0] * 20 + [100.0] * 50 + [0.0] * 10 + [100.0] * 100)
+    # Flat again once the window of 10 holds no collapsed episode (9 of 10 at 100 is 90: near).
+    assert m.convergence_steps_range(returns, 0.1, 100, 10, 0) == (89, False)
+
+
+@pytest.mark.parametrize("final", [-500.0, -499.1, -600.0])
+def test_a_run_no_better_than_random_reaches_nothing(final):
+    returns = np.full(200, final)
+    assert m.sample_efficiency_range(returns, 0.75, final, 50, -499.1) == (200, True)
+    assert m.convergence_steps_range(returns, 0.1, final, 50, -499.1) == (200, True)
+    # Final and random equal: the band has no width, and the average lies exactly within it.
+    assert m.convergence_steps_range(returns, 0.1, final, 50, final) == (200, True)
+
+
+def test_a_run_shorter_than_the_window_is_censored():
+    returns = np.full(20, 100.0)
+    assert m.sample_efficiency_range(returns, 0.75, 100, 50, 0) == (20, True)
+    assert m.convergence_steps_range(returns, 0.1, 100, 50, 0) == (20, True)
+
+
+def test_area_under_curve_is_the_mean_return():
+    assert m.area_under_curve(np.array([0.0, 1.0, 2.0, 5.0])) == 2
+
+
+def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
+    average = m.moving_average(np.full(1000, 0.1), 50)
+    assert len(set(average.tolist())) == 1
+    assert len(m.moving_average(np.ones(49), 50)) == 0
+    np.testing.assert_allclose(
+        m.moving_average(noisy(0), 25), pd.Series(noisy(0)).rolling(25).mean().dropna()
+    )
+
+
+# rows, the table, the file
+
+
+def runs():
+    return {
+        run: frame(noisy(i) - 300 * (run[0] == "Acrobot-v1"), length=7)
+        for i, run in enumerate(product(ENVIRONMENTS, VARIANTS, SEEDS))
+    }
+
+
+def table(**changed):
+    arguments = {"runs": runs(), "environments": ENVIRONMENTS, "variants": VARIANTS}
+    return m.metrics_table(**arguments | {"seeds": SEEDS, "settings": CONFIG} | changed)
+
+
+def test_a_row_holds_each_metric_under_its_name():
+    returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
+    row = m.metrics_of_run(frame(returns, 9), "CartPole-v1", "ppo", 4, CONFIG)
+    assert row == {
+        "env": "CartPole-v1",
+        "variant": "ppo",
+        "seed": 4,
+        "episodes": 1000,
+        "env_steps": 9000,
+        "final_return": 500.0,
+        "sample_efficiency": 201,
+        "convergence_steps": 300,  # both windows of 50 at 500: episodes 201 to 300
+        "area_under_curve": 404.0,
+        "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
+        "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
+        "convergence_steps_flattest": 100,
+        "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
+        "sample_efficiency_censored": 0,
+        "convergence_steps_censored": 0,
+        "sample_efficiency_range_censored": 0,
+        "convergence_steps_range_censored": 0,
+        "convergence_steps_flattest_censored": 0,
+        "convergence_steps_public_code_censored": 0,
+    }
+    assert list(row) == list(m.METRICS_COLUMNS)
+
+
+def test_the_table_is_in_the_configured_order_and_counts_censored_runs():
+    result = table()
+    assert list(result.columns) == list(m.METRICS_COLUMNS)
+    found = list(zip(result["env"], result["variant"], result["seed"], strict=True))
+    assert found == list(product(ENVIRONMENTS, VARIANTS, SEEDS))
+    assert not result.isna().any(axis=None)
+    acrobot = result[result["env"] == "Acrobot-v1"]
+    assert (acrobot["sample_efficiency_censored"] == 1).all()  # the bar is above the final return
+    assert (acrobot["sample_efficiency"] == 400).all()
+
+
+def test_metrics_come_back_to_the_bit(tmp_path):
+    written = table()
+    written.to_csv(tmp_path / "metrics.csv", index=False)
+    read = m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS)
+    pd.testing.assert_frame_equal(read, written, check_exact=True)
+
+
+def test_a_missing_run_is_an_error_and_never_a_smaller_n():
+    fewer = runs()
+    del fewer["Acrobot-v1", "ppo", 1]
+    with pytest.raises(RecordError, match="the run Acrobot-v1, ppo, seed 1 is missing"):
+        table(runs=fewer)
+    with pytest.raises(RecordError, match="seed 1 in the records is not in the configuration"):
+        table(seeds=[3])
+    shorter = runs()
+    shorter["Acrobot-v1", "ppo", 1] = frame(noisy(0, 399))
+    with pytest.raises(RecordError, match=r"Acrobot-v1, ppo have different .* \[399, 400\]"):
+        table(runs=shorter)
+
+
+def test_an_environment_without_random_return_is_an_error_that_names_the_key():
+    with pytest.raises(ConfigError, match=r"'metrics\.random_return\.Pendulum-v1' is missing"):
+        m.random_return(CONFIG, "Pendulum-v1")
+    assert m.random_return(CONFIG, "CartPole-v1") == 22.1
+
+
+def change(row, column, value):
+    def damage(lines):
+        cells = lines[row].split(",")
+        cells[list(m.METRICS_COLUMNS).index(column)] = value
+        lines[row] = ",".join(cells)
+
+    return damage
+
+
+DAMAGE = {
+    "a run lost": (lambda lines: lines.pop(3), "mace_full, seed 3 is missing"),
+    "a run twice": (lambda lines: lines.append(lines[1]), "seed 3 stands more than once"),
+    "rows swapped": (lambda lines: lines.insert(1, lines.pop(2)), "line 2: .*seed 1 stands where"),
+    "another seed": (change(8, "seed", "7"), "seed 1 is missing"),
+    "another variant": (change(1, "variant", "ppO"), "ppo, seed 3 is missing"),
+    "a column lost": (lambda lines: lines.__setitem__(0, lines[0][:-9]), "line 1: the column"),
+    "NaN": (change(5, "final_return", "nan"), "line 6: final_return is 'nan'"),
+    "empty": (change(5, "convergence_steps", ""), "line 6: convergence_steps is ''"),
+    "episode 0": (change(5, "sample_efficiency", "0"), "line 6: sample_efficiency is 0 of 400"),
+    "beyond E": (change(2, "sample_efficiency", "401"), "line 3: sample_efficiency is 401 of 400"),
+    "a flag of 2": (change(2, "convergence_steps_censored", "2"), "line 3: convergence_steps"),
+    "a flag too much": (change(2, "sample_efficiency_censored", "1"), "line 3: sample_efficiency"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
+    spoil, named = DAMAGE[damage]
+    path = tmp_path / "metrics.csv"
+    lines = table().to_csv(index=False).splitlines()
+    spoil(lines)
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordError, match=named) as refusal:
+        m.read_metrics(path, ENVIRONMENTS, VARIANTS, SEEDS)
+    assert str(path) in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("final_fraction", 0),
+        ("final_fraction", 1.1),
+        ("threshold", 1.0),
+        ("moving_average", 0),
+        ("moving_average", 50.5),
+        ("convergence_band", -0.1),
+        ("confidence", 95),
+        ("bootstrap_repetitions", 99),
+        ("bootstrap_seed", -1),
+        ("random_return", 22.1),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused(key, value):
+    with pytest.raises(ConfigError, match=f"test: {key} is {value}"):
+        check(m.MetricsConfig, SETTINGS | {key: value}, "test")
+
+
+def test_random_returns_are_finite_numbers_and_unknown_keys_are_refused():
+    for value in (float("nan"), float("inf"), "22", True):
+        with pytest.raises(ConfigError, match=r"random_return\.CartPole-v1"):
+            check(m.MetricsConfig, SETTINGS | {"random_return": {"CartPole-v1": value}}, "test")
+    with pytest.raises(ConfigError, match="nearest known key is 'threshold'"):
+        check(m.MetricsConfig, SETTINGS | {"treshold": 0.5}, "test")

@@ -1,0 +1,212 @@
+"""The contract of episodes.csv: it comes back to the bit, and what is damaged is refused."""
+
+import csv
+import os
+
+import numpy as np
+import pytest
+
+from mace_rl.files import write_atomically
+from mace_rl.records import RecordError, read_episodes, read_rows, write_episodes
+
+HEADER = "episode,env_steps,length,extrinsic_return,intrinsic_return,beta,terminated"
+ROWS = ["1,10,10,9.5,0.25,0.4,1", "2,30,20,-19.0,3e-05,0.3996,0", "3,31,1,0.1,0.0,0.0,1"]
+
+
+def columns(episodes=3):
+    """Columns of awkward doubles: subnormal, largest, negative zero, and random mantissas."""
+    generator = np.random.default_rng(0)
+    length = generator.integers(1, 500, episodes)
+    extrinsic = generator.normal(size=episodes) * 10.0 ** generator.integers(-20, 20, episodes)
+    extrinsic[: min(3, episodes)] = [5e-324, np.finfo(float).max, -0.0][:episodes]
+    return {
+        "episode": np.arange(1, episodes + 1),
+        "env_steps": np.cumsum(length),
+        "length": length,
+        "extrinsic_return": extrinsic,
+        "intrinsic_return": generator.random(episodes) / 3,
+        "beta": generator.random(episodes),
+        "terminated": generator.integers(0, 2, episodes),
+    }
+
+
+def text(rows=ROWS, header=HEADER):
+    return "\n".join([header, *rows]) + "\n"
+
+
+def test_doubles_and_integers_come_back_to_the_bit(tmp_path):
+    written = columns(1000)
+    write_episodes(tmp_path / "episodes.csv", written)
+    frame = read_episodes(tmp_path / "episodes.csv", 1000)
+    assert list(frame.columns) == HEADER.split(",")
+    for name, values in written.items():
+        assert frame[name].dtype == values.dtype
+        assert frame[name].to_numpy().tobytes() == values.tobytes()
+
+
+def test_the_file_is_plain_csv_with_shortest_doubles(tmp_path):
+    path = tmp_path / "episodes.csv"
+    one = {name: values[:1] for name, values in columns().items()}
+    write_episodes(path, one | {"extrinsic_return": np.array([0.1]), "beta": np.array([1])})
+    with path.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["extrinsic_return"] == "0.1"
+    assert row["beta"] == "1.0"
+    assert row["episode"] == "1"
+
+
+def test_a_valid_file_written_by_hand_is_read(tmp_path):
+    path = tmp_path / "episodes.csv"
+    path.write_text(text())
+    frame = read_episodes(path, 3)
+    assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
+    assert frame["terminated"].tolist() == [1, 0, 1]
+
+
+DAMAGE = {  # what the file holds, and what the message must name
+    "empty": ("", "line 1", "empty"),
+    "header only": (text([]), "line 1", "0 episodes"),
+    "half a last line": (text()[:-8], "line 4", "ends within"),
+    "no last newline": (text()[:-1], "line 4", "ends within"),
+    "a missing column": (text(header=HEADER[: -len(",terminated")]), "line 1", "terminated"),
+    "an extra column": (text(header=HEADER + ",reward"), "line 1", "reward"),
+    "a renamed column": (text(header=HEADER.replace("beta", "Beta")), "line 1", "beta"),
+    "reordered": (text(header=HEADER.replace("length,", "") + ",length"), "line 1", "instead of"),
+    "no header": ("\n".join(ROWS) + "\n", "line 1", "episode"),
+    "a short row": (text([ROWS[0], "2,30,20,-19.0,0.5,0.3996", ROWS[2]]), "line 3", "6 cells"),
+    "a long row": (text([ROWS[0] + ",1", *ROWS[1:]]), "line 2", "8 cells"),
+    "a blank line": (text([*ROWS, ""]), "line 5", "1 cells"),
+    "a blank line within": (text([ROWS[0], "", *ROWS[1:]]), "line 3", "1 cells"),
+    "a gap": (text([ROWS[0], "3,30,20,-19.0,0.0,0.4,0"]), "line 3", "episode is 3"),
+    "a repeat": (text([ROWS[0], *ROWS]), "line 3", "episode is 1"),
+    "from zero": (text(["0,10,10,9.5,0.25,0.4,1"]), "line 2", "episode is 0"),
+    "swapped rows": (text([ROWS[1], ROWS[0], ROWS[2]]), "line 2", "episode is 2"),
+    "fewer episodes": (text(ROWS[:2]), "line 3", "2 episodes"),
+    "more episodes": (text([*ROWS, "4,32,1,0.1,0.0,0.0,1"]), "line 5", "4 episodes"),
+    "text": (text([ROWS[0].replace("9.5", "many")]), "line 2", "extrinsic_return is 'many'"),
+    "an empty cell": (text([ROWS[0].replace("9.5", "")]), "line 2", "extrinsic_return is ''"),
+    "NaN": (text([ROWS[0].replace("9.5", "nan")]), "line 2", "extrinsic_return is 'nan'"),
+    "Inf": (text([ROWS[0].replace("0.25", "inf")]), "line 2", "intrinsic_return is 'inf'"),
+    "overflow": (text([ROWS[0].replace("9.5", "1e999")]), "line 2", "'1e999'"),
+    "underscore": (text([ROWS[0].replace("9.5", "9_5")]), "line 2", "'9_5'"),
+    "a space": (text([ROWS[0].replace("9.5", " 9.5")]), "line 2", "' 9.5'"),
+    "a float for an integer": (text(["1.0" + ROWS[0][1:]]), "line 2", "episode is '1.0'"),
+    "an enormous integer": (text(["1," + "9" * 30 + ",10,9.5,0.25,0.4,1"]), "line 2", "env_steps"),
+    "env_steps": (text([ROWS[0], ROWS[1].replace("30", "31")]), "line 3", "env_steps is 31"),
+    "length": (text(["1,0,0,9.5,0.25,0.4,1"]), "line 2", "length is 0"),
+    "a negative length": (text(["1,-5,-5,9.5,0.25,0.4,1"]), "line 2", "length is -5"),
+    "intrinsic": (text([ROWS[0].replace("0.25", "-0.25")]), "line 2", "intrinsic_return is -0.25"),
+    "beta above": (text([ROWS[0].replace("0.4", "1.5")]), "line 2", "beta is 1.5"),
+    "beta below": (text([ROWS[0].replace("0.4", "-0.1")]), "line 2", "beta is -0.1"),
+    "terminated": (text([ROWS[0][:-1] + "2"]), "line 2", "terminated is 2"),
+    "terminated as a word": (text([ROWS[0][:-1] + "True"]), "line 2", "terminated is 'True'"),
+    "windows newlines": (text().replace("\n", "\r\n"), "line 1", "terminated"),
+    "semicolons": (text().replace(",", ";"), "line 1", "episode"),
+    "a NUL": (text([ROWS[0].replace("9.5", "9\0")]), "line 2", "extrinsic_return"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_file_is_refused_with_its_line(damage, tmp_path):
+    content, line, named = DAMAGE[damage]
+    path = tmp_path / "épisodes 1.csv"
+    path.write_bytes(content.encode())
+    with pytest.raises(RecordError) as refusal:
+        read_episodes(path, 3)
+    message = str(refusal.value)
+    assert message.startswith(f"{path}: {line}")
+    assert named in message
+    assert "\n" not in message
+
+
+def test_every_cut_is_refused(tmp_path):
+    """A file cut off after any number of bytes is never taken for a whole one."""
+    whole = text().encode()
+    for size in range(len(whole)):
+        (tmp_path / "cut.csv").write_bytes(whole[:size])
+        with pytest.raises(RecordError):
+            read_episodes(tmp_path / "cut.csv", 3)
+
+
+def test_the_first_bad_line_is_named(tmp_path):
+    (tmp_path / "e.csv").write_text(text(["1,10,10,9.5,0.25,9.0,1", "7,30,20,-19.0,0.5,0.3,0"]))
+    with pytest.raises(RecordError, match="line 2: beta"):
+        read_episodes(tmp_path / "e.csv", 2)
+
+
+def test_missing_files_folders_and_other_encodings_are_refused(tmp_path):
+    with pytest.raises(RecordError, match=r"none\.csv: cannot be read: No such file"):
+        read_episodes(tmp_path / "none.csv", 3)
+    with pytest.raises(RecordError, match="Is a directory"):
+        read_episodes(tmp_path, 3)
+    (tmp_path / "latin.csv").write_bytes(text([ROWS[0], "\xe9"]).encode("latin-1"))
+    with pytest.raises(RecordError, match="line 3: not UTF-8"):
+        read_episodes(tmp_path / "latin.csv", 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "named"),
+    [
+        ("extrinsic_return", np.array([1.0, np.nan, 1.0]), "line 3: extrinsic_return is nan"),
+        ("intrinsic_return", np.array([1.0, 1.0, np.inf]), "line 4: intrinsic_return is inf"),
+        ("beta", np.array([0.5, 0.5, 2.0]), "line 4: beta is 2.0"),
+        ("length", np.array([1.0, 2.0, 3.0]), "column length is of type float64, not int"),
+        ("beta", np.array(["a", "b", "c"]), "column beta is of type"),
+        ("beta", np.array([0.5, 0.5]), "one shape"),
+        ("beta", np.full((3, 1), 0.5), "one shape"),
+    ],
+)
+def test_what_would_be_refused_is_not_written(name, value, named, tmp_path):
+    with pytest.raises(RecordError, match=named):
+        write_episodes(tmp_path / "episodes.csv", columns() | {name: value})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_columns_to_write_are_exactly_the_contract(tmp_path):
+    whole = columns()
+    for wrong in (
+        {name: whole[name] for name in whole if name != "beta"},
+        whole | {"reward": whole["beta"]},
+        dict(reversed(whole.items())),
+    ):
+        with pytest.raises(RecordError, match="column"):
+            write_episodes(tmp_path / "episodes.csv", wrong)
+
+
+def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "episodes.csv"
+    path.write_text("before")
+
+    def fail(descriptor):
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        with pytest.raises(OSError, match="disk full"):
+            write_episodes(path, columns())
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+    write_episodes(path, columns())
+    assert len(read_episodes(path, 3)) == 3
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_reader_of_the_old_file_never_sees_the_new_one(tmp_path):
+    path = tmp_path / "episodes.csv"
+    write_atomically(path, "before, and longer")
+    with path.open() as reader:
+        write_atomically(path, "after")
+        assert reader.read() == "before, and longer"
+    assert path.read_text() == "after"
+
+
+def test_write_atomically_keeps_the_text_as_it_is(tmp_path):
+    write_atomically(tmp_path / "claims.md", "β\n")
+    assert (tmp_path / "claims.md").read_bytes() == "β\n".encode()
+
+
+def test_rows_of_text_and_numbers(tmp_path):
+    (tmp_path / "t.csv").write_text("env,n,x\nCartPole-v1,3,0.1\n")
+    assert read_rows(tmp_path / "t.csv", {"env": str, "n": int, "x": float}) == [
+        ("CartPole-v1", 3, 0.1)
+    ]

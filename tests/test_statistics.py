@@ -1,0 +1,192 @@
+"""Statistics against hand calculations, exhaustive enumeration and scipy."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from mace_rl import statistics as s
+
+REPETITIONS = 5000
+FIVE = np.array([186.0, 201.0, 249.0, 140.0, 120.0])
+OTHER = np.array([170.0, 230.0, 249.0, 150.0, 95.0])
+TWELVE = np.array([3.0, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5, 8])
+
+
+def generator(seed=0):
+    return np.random.default_rng(seed)
+
+
+def interval(values, seed=0):
+    return s.mean_interval(values, 0.95, REPETITIONS, generator(seed))
+
+
+def test_interquartile_mean_by_hand():
+    assert s.interquartile_mean(np.array([100.0, 1, 2, 3, 4, 5, 6, -50])) == 3.5  # of 2, 3, 4, 5
+    assert s.interquartile_mean(np.array([9.0, 1, 2, 3, 0])) == 2  # of 1, 2, 3: floor(5 / 4) off
+    assert s.interquartile_mean(np.array([0.0, 1, 5])) == 2  # three: nothing off
+    np.testing.assert_array_equal(s.interquartile_mean(np.array([[0.0, 1, 1, 9]]), axis=1), [1])
+
+
+def test_below_ten_seeds_the_interval_is_students():
+    assert s.interval_kind(9) == "t"
+    expected = scipy.stats.t.interval(0.95, 4, FIVE.mean(), scipy.stats.sem(FIVE))
+    np.testing.assert_allclose(interval(FIVE), expected, rtol=1e-12)
+    # By hand: 0 and 2 have mean 1, standard error 1 and t of one degree of freedom 12.706.
+    np.testing.assert_allclose(interval(np.array([0.0, 2.0])), (1 - 12.7062, 1 + 12.7062), 1e-4)
+
+
+def test_from_ten_seeds_on_the_interval_is_the_percentile_bootstrap():
+    assert s.interval_kind(10) == "bootstrap"
+    expected = scipy.stats.bootstrap(
+        (TWELVE,), np.mean, n_resamples=REPETITIONS, method="percentile", rng=generator(1)
+    ).confidence_interval
+    np.testing.assert_allclose(interval(TWELVE), expected, atol=0.1)
+
+
+def test_bootstrap_of_two_seeds_by_enumeration():
+    # Means of two draws from {0, 1}: 0, ½, 1 with probabilities ¼, ½, ¼.
+    values = np.array([0.0, 1.0])
+    low, high = s.bootstrap_interval(values, np.mean, 0.4, REPETITIONS, generator())
+    assert (low, high) == (0.5, 0.5)  # the tails of 30 % hold the ends
+    low, high = s.bootstrap_interval(values, np.mean, 0.6, REPETITIONS, generator())
+    assert (low, high) == (0, 1)
+
+
+def test_bootstrap_of_the_interquartile_mean_against_a_loop():
+    draws = generator(2)
+    resampled = [
+        scipy.stats.trim_mean(draws.choice(TWELVE, size=12), 0.25) for _ in range(REPETITIONS)
+    ]
+    observed = s.bootstrap_interval(TWELVE, s.interquartile_mean, 0.95, REPETITIONS, generator())
+    np.testing.assert_allclose(observed, np.percentile(resampled, [2.5, 97.5]), atol=0.15)
+
+
+@pytest.mark.parametrize("seeds", [5, 12])
+def test_curves_are_treated_point_by_point(seeds, monkeypatch):
+    values = generator(3).normal(size=(seeds, 50))
+    monkeypatch.setattr(s, "CHUNK", 7 * seeds * REPETITIONS)  # 7 points at a time
+    low, high = interval(values)
+    assert low.shape == high.shape == (50,)
+    for point in (0, 6, 7, 49):
+        np.testing.assert_allclose((low[point], high[point]), interval(values[:, point]))
+
+
+def test_the_generator_decides():
+    values = generator().normal(size=12)
+    assert interval(values) == interval(values)
+    assert interval(values) != interval(values, seed=1)
+
+
+@pytest.mark.parametrize("seeds", [5, 15])
+def test_intervals_cover_the_true_mean_about_as_often_as_they_say(seeds):
+    draws = generator(4)
+    hits = 0
+    for _ in range(300):
+        low, high = s.mean_interval(draws.normal(size=seeds), 0.9, 500, draws)
+        hits += bool(low <= 0 <= high)
+    assert 0.82 <= hits / 300 <= 0.95
+
+
+def test_one_seed_allows_no_interval():
+    assert np.isnan(interval(np.array([5.0]))).all()
+    assert np.isnan(interval(np.ones((1, 3)))).all()
+    nothing = s.bootstrap_interval(np.array([5.0]), np.mean, 0.95, REPETITIONS, generator())
+    assert np.isnan(nothing).all()
+
+
+def test_equal_seeds_give_an_interval_of_no_width():
+    for seeds in (2, 9, 10, 30):
+        low, high = interval(np.full(seeds, 2000.0))
+        assert low == high == 2000
+
+
+def test_paired_comparison_against_scipy_and_enumeration():
+    result = s.paired_comparison(FIVE, OTHER, 0.95, REPETITIONS, generator())
+    difference = FIVE - OTHER
+    assert result.difference == pytest.approx(sum(difference) / 5)
+    assert (result.low, result.high) == pytest.approx(
+        scipy.stats.ttest_rel(FIVE, OTHER).confidence_interval(0.95)
+    )
+    assert result.t_test == pytest.approx(scipy.stats.ttest_rel(FIVE, OTHER).pvalue)
+    flips = [abs(np.dot(signs, difference)) for signs in product((-1, 1), repeat=5)]
+    assert result.sign_flip == np.mean(np.array(flips) >= abs(difference.sum()))
+    assert result.seeds == 5
+
+
+def test_pairing_finds_a_small_difference_behind_large_seed_effects():
+    noise = generator(5).normal(size=8) * 1000
+    result = s.paired_comparison(
+        noise + 1 + generator(6).normal(size=8) * 0.1, noise, 0.95, REPETITIONS, generator()
+    )
+    assert result.t_test < 0.001
+    assert result.sign_flip == 2 / 2**8  # no smaller p value exists for eight seeds
+    assert scipy.stats.ttest_ind(noise + 1, noise).pvalue > 0.9
+
+
+def test_paired_comparison_at_its_limits():
+    same = s.paired_comparison(FIVE, FIVE, 0.95, REPETITIONS, generator())
+    assert same[:5] == (0, 0, 0, 1, 1)
+    shifted = s.paired_comparison(FIVE + 1, FIVE, 0.95, REPETITIONS, generator())
+    assert shifted[:5] == (1, 1, 1, 0, 2 / 2**5)
+    one = s.paired_comparison(FIVE[:1], OTHER[:1], 0.95, REPETITIONS, generator())
+    assert one.difference == 16
+    assert np.isnan(one[1:5]).all()
+    with pytest.raises(ValueError, match=r"\(5,\) and \(4,\)"):
+        s.paired_comparison(FIVE, OTHER[:4], 0.95, REPETITIONS, generator())
+
+
+def test_probability_of_improvement_against_a_loop_and_scipy():
+    probability, (low, high) = s.probability_of_improvement(
+        FIVE, OTHER[:4], 0.95, REPETITIONS, generator()
+    )
+    wins = [(x > y) + 0.5 * (x == y) for x in FIVE for y in OTHER[:4]]
+    assert probability == sum(wins) / 20
+    u = scipy.stats.mannwhitneyu(FIVE, OTHER[:4], alternative="greater").statistic
+    assert probability == u / 20  # rliable's formula
+    draws = generator(7)
+    resampled = []
+    for _ in range(REPETITIONS):
+        x, y = draws.choice(FIVE, 5), draws.choice(OTHER[:4], 4)
+        resampled.append(np.mean([(a > b) + 0.5 * (a == b) for a in x for b in y]))
+    np.testing.assert_allclose((low, high), np.percentile(resampled, [2.5, 97.5]), atol=0.051)
+
+
+def test_probability_of_improvement_at_its_limits():
+    def probability(x, y):
+        return s.probability_of_improvement(
+            np.array(x, float), np.array(y, float), 0.95, REPETITIONS, generator()
+        )
+
+    assert probability([2, 3], [0, 1]) == (1, (1, 1))
+    assert probability([0, 1], [2, 3]) == (0, (0, 0))
+    assert probability([1, 1], [1, 1]) == (0.5, (0.5, 0.5))
+    value, bounds = probability([2], [1, 3])
+    assert value == 0.5
+    assert np.isnan(bounds).all()
+
+
+def test_holm_by_hand():
+    # Sorted: 0.005 · 4, 0.01 · 3, 0.03 · 2, 0.04 · 1 = 0.02, 0.03, 0.06, then at least 0.06.
+    np.testing.assert_allclose(s.holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(s.holm([0.5, 0.9]), [1, 1])
+    assert s.holm([0.05]).tolist() == [0.05]
+    assert s.holm([]).tolist() == []
+
+
+def test_holm_rejects_what_the_step_down_procedure_rejects():
+    for seed in range(50):
+        p = generator(seed).random(6) ** 3
+        rejected = set()
+        for k, i in enumerate(sorted(range(6), key=p.__getitem__)):
+            if p[i] > 0.05 / (6 - k):
+                break
+            rejected.add(i)
+        assert set(np.flatnonzero(s.holm(p) <= 0.05)) == rejected
+
+
+@pytest.mark.parametrize("p", [[-0.1], [1.1, 0.5], [float("nan")]])
+def test_holm_refuses_what_is_no_p_value(p):
+    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
+        s.holm(p)

@@ -1,0 +1,296 @@
+"""Tables from a small frame: the numbers against pandas and scipy, the LaTeX by its structure."""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from mace_rl.hyperparameters import PPOConfig
+from mace_rl.metrics import METRICS_COLUMNS, MetricsConfig
+from mace_rl.tables import (
+    PAPER_TABLE1,
+    SUPPLEMENT_METRICS,
+    latex,
+    summary,
+    supplement,
+    supplement_latex,
+    table1,
+    table1_latex,
+    table2_latex,
+)
+
+SETTINGS = MetricsConfig(
+    final_fraction=0.1,
+    threshold=0.75,
+    moving_average=50,
+    convergence_band=0.1,
+    confidence=0.95,
+    bootstrap_repetitions=1000,
+    bootstrap_seed=0,
+    random_return={},
+)
+PAPER = ["Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0"]
+VARIANTS = ["ppo", "mace_fixed", "mace_full"]
+LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
+PPO = PPOConfig(
+    actor_learning_rate=0.0003,
+    critic_learning_rate=0.001,
+    discount=0.99,
+    epochs=4,
+    clip=0.2,
+    gae_lambda=1.0,
+    entropy_coefficient=1e-05,
+    rollout_steps=1,
+    minibatch_size=None,
+    hidden_units=[64, 32],
+    initial_log_std=0.0,
+    max_gradient_norm=0.5,
+    normalise_observations=False,
+)
+
+
+def metrics(environments=PAPER, variants=VARIANTS, seeds=3, **values):
+    """A metrics.csv; `values` are per variant, [seeds] each: `sample_efficiency={"ppo": [...]}`."""
+    draws = np.random.default_rng(0)
+    rows = []
+    for environment in environments:
+        for variant in variants:
+            for seed in range(seeds):
+                row = dict.fromkeys(METRICS_COLUMNS, 0)
+                row |= {name: int(draws.integers(100, 990)) for name in SUPPLEMENT_METRICS}
+                row |= {"env": environment, "variant": variant, "seed": seed, "episodes": 2000}
+                row |= {"sample_efficiency": int(draws.integers(100, 990))}
+                row |= {"convergence_steps": int(draws.integers(1000, 2000))}
+                row |= {"final_return": -85.25, "area_under_curve": -116.75}
+                row |= {name: given[variant][seed] for name, given in values.items()}
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def cells(fragment):
+    """{(variant or row label, place of the column): cell}, as printed."""
+    found = {}
+    for line in fragment.splitlines():
+        if line.startswith(r"\raggedright"):
+            label, *values = line.removeprefix(r"\raggedright ").removesuffix(r" \\").split(" & ")
+            label = label.replace(r"\newline ", " ").replace(r"$\beta$", "β")
+            name = next((name for name in LABELS if LABELS[name] == label), label)
+            found |= {(name, place): value for place, value in enumerate(values)}
+    return found
+
+
+def test_summary_against_pandas_and_scipy():
+    frame = metrics(seeds=5)
+    result = table1(frame, SETTINGS)
+    assert len(result) == 3 * 3 * 2
+    for row in result.itertuples():
+        values = frame.query("env == @row.env and variant == @row.variant")[row.metric]
+        assert row.mean == pytest.approx(values.mean())
+        low, high = scipy.stats.t.interval(0.95, 4, values.mean(), values.sem())
+        assert (row.low, row.high) == pytest.approx((max(low, 1), min(high, 2000)))
+        assert (row.seeds, row.censored, row.episodes) == (5, 0, 2000)
+
+
+def test_the_papers_numbers_stand_beside_ours():
+    result = table1(metrics(["CartPole-v1", "Pendulum-v1"], ["ppo", "mace_fixed_0.2"]), SETTINGS)
+    papers = result.set_index(["env", "variant", "metric"])["paper"]
+    assert papers["CartPole-v1", "ppo", "sample_efficiency"] == 140
+    assert papers["CartPole-v1", "ppo", "convergence_steps"] == 660
+    assert papers.isna().sum() == 6
+    # Table 1 of the paper, read across its rows.
+    across = [PAPER_TABLE1[environment, variant] for variant in VARIANTS for environment in PAPER]
+    assert across == [
+        *((186, 617), (140, 660), (865, 1841)),
+        *((201, 595), (120, 620), (782, 1801)),
+        *((249, 586), (104, 634), (495, 1799)),
+    ]
+
+
+def test_censored_runs_are_counted_and_kept():
+    frame = metrics(
+        ["Acrobot-v1"],
+        ["ppo"],
+        sample_efficiency={"ppo": [100, 2000, 2000]},
+        sample_efficiency_censored={"ppo": [0, 1, 1]},
+    )
+    row = summary(frame, ["sample_efficiency"], SETTINGS).iloc[0]
+    assert row["mean"] == pytest.approx(4100 / 3)
+    assert row["censored"] == 2
+    assert r"\textbf{1367}$^{\dagger2}$" in table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+
+
+def test_no_cell_depends_on_another_environment_or_variant():
+    """Bootstrap intervals included: more columns do not change a number."""
+    all_of_it = metrics(seeds=12)
+    part = all_of_it[(all_of_it["env"] == "CartPole-v1") & (all_of_it["variant"] == "mace_full")]
+    alone, among = table1(part, SETTINGS), table1(all_of_it, SETTINGS)
+    among = among[(among["env"] == "CartPole-v1") & (among["variant"] == "mace_full")]
+    pd.testing.assert_frame_equal(alone, among.reset_index(drop=True), check_exact=True)
+
+
+def test_table1_csv_comes_back_to_the_bit(tmp_path):
+    written = table1(metrics(), SETTINGS)
+    written.to_csv(tmp_path / "table1.csv", index=False)
+    read = pd.read_csv(tmp_path / "table1.csv")
+    for name in ("mean", "low", "high"):
+        assert read[name].to_numpy().tobytes() == written[name].to_numpy().tobytes()
+
+
+def test_table1_has_the_papers_layout():
+    frame = metrics(
+        ["CartPole-v1"],
+        sample_efficiency={"ppo": [1, 2, 3], "mace_fixed": [120] * 3, "mace_full": [104] * 3},
+        convergence_steps={"ppo": [660] * 3, "mace_fixed": [620] * 3, "mace_full": [634] * 3},
+    )
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    found = cells(fragment)
+    assert [name for name, _ in found] == list(LABELS)
+    # Mean 2, standard error 1 / √3, t of two degrees of freedom 4.303: 2 ± 2.48, but not below 1.
+    assert r"\textbf{2} / 660\\{\scriptsize [1,\,4]/[660,\,660]}" in found["ppo", 0]
+    assert r"120 / \textbf{620}\\" in found["mace_fixed", 0]
+    assert r"104 / 634\\" in found["mace_full", 0]
+    assert r"Algorithm & CartPole-v1 \\" in fragment
+    assert r"Means over 3 seeds and, below, their 95\,\% $t$ intervals." in fragment
+    assert "Training budget: 2000 episodes (CartPole-v1)." in fragment
+    assert "dagger" not in fragment
+
+
+def test_ties_are_all_bold_as_displayed():
+    frame = metrics(
+        ["CartPole-v1"],
+        sample_efficiency={"ppo": [104, 104, 105], "mace_fixed": [104] * 3, "mace_full": [105] * 3},
+        convergence_steps={variant: [600] * 3 for variant in VARIANTS},
+    )
+    found = cells(table1_latex(table1(frame, SETTINGS), LABELS, 0.95))
+    assert r"\textbf{104} / \textbf{600}" in found["ppo", 0]  # 104.33 is shown as 104
+    assert r"\textbf{104} / \textbf{600}" in found["mace_fixed", 0]
+    assert r"}105 / \textbf{600}" in found["mace_full", 0]
+
+
+def test_a_mean_of_seeds_that_all_failed_is_never_the_best():
+    frame = metrics(
+        ["CartPole-v1"],
+        ["ppo"],
+        convergence_steps={"ppo": [2000] * 3},
+        convergence_steps_censored={"ppo": [1] * 3},
+    )
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    assert r" / 2000$^{\dagger3}$" in cells(fragment)["ppo", 0]
+    assert "a lower bound" in fragment
+
+
+def test_one_seed_has_no_interval():
+    fragment = table1_latex(table1(metrics(seeds=1), SETTINGS), LABELS, 0.95)
+    assert r"{\scriptsize --/--}" in fragment
+    assert "One seed, which allows no interval." in fragment
+    assert "nan" not in fragment
+
+
+def test_the_caption_names_the_interval_and_every_budget():
+    frame = metrics(seeds=10)
+    frame.loc[frame["env"] == "HopperBulletEnv-v0", "episodes"] = 6000
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    assert r"Means over 10 seeds and, below, their 95\,\% bootstrap intervals." in fragment
+    assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
+
+
+def test_more_than_three_environments_continue_below():
+    environments = [*PAPER, "Under_score-v0", "Pendulum-v1"]
+    fragment = table1_latex(table1(metrics(environments), SETTINGS), {}, 0.95)
+    heads = re.findall(r"Algorithm & (.*) \\\\", fragment)
+    assert heads == [" & ".join(PAPER), r"Under\_score-v0 & Pendulum-v1"]
+    assert fragment.count("mace\\_full &") == 2
+
+
+def test_the_supplement_has_every_companion():
+    fragment = supplement_latex(supplement(metrics(), SETTINGS), LABELS, 0.95)
+    found = cells(fragment)
+    assert {name for name, _ in found} == set(SUPPLEMENT_METRICS.values())
+    assert r"$-$85.2\\{\scriptsize [$-$85.2,\,$-$85.2]}" in found["Final return", 0]
+    assert fragment.count(r"\multicolumn{4}") == 3
+    companions = [name for name in METRICS_COLUMNS if f"{name}_censored" in METRICS_COLUMNS]
+    assert set(companions) <= {*SUPPLEMENT_METRICS, "sample_efficiency", "convergence_steps"}
+
+
+def test_table2_has_the_papers_rows_then_ours():
+    hopper = PPO.model_copy(update={"gae_lambda": 0.95, "normalise_observations": True})
+    fragment = table2_latex({"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": hopper})
+    paper, ours = fragment.split(r"\midrule")[1:]
+    assert re.findall(r"\\raggedright (.*) \\\\", paper) == [
+        "Actor Learning Rate & 0.0003",
+        "Critic Learning Rate & 0.001",
+        r"Discount Factor ($\gamma$) & 0.99",
+        "PPO Epochs ($K$) & 4",
+        r"PPO Clip Parameter ($\epsilon$) & 0.2",
+        "Optimizer & Adam",
+    ]
+    assert r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)" in ours
+    assert r"no (Acrobot-v1, A\_b-v0)\\yes (Hopper)" in ours
+    assert r"Entropy Coefficient & $1 \times 10^{-5}$ \\" in ours
+    assert "& 64, 32 " in ours
+    assert "None" not in ours
+    # Every setting is there: five of the paper's rows and Adam, and a row for each of the others.
+    assert fragment.count("raggedright") == len(PPOConfig.model_fields) + 1
+
+
+def test_special_characters_are_escaped_once():
+    assert latex(r"a_b & 50 % β ~ \x {1} #2 $3^4 λ") == (
+        r"a\_b \& 50 \% $\beta$ \textasciitilde{} \textbackslash{}x \{1\} \#2"
+        r" \$3\textasciicircum{}4 $\lambda$"
+    )
+
+
+def fragments():
+    many = metrics([*PAPER, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
+    many["sample_efficiency"] += 1000  # four digits in every cell are the widest there are
+    many["episodes"] = 6000
+    labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
+    return [
+        table1_latex(table1(many, SETTINGS), labels, 0.95),
+        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, 0.95),
+        supplement_latex(supplement(many, SETTINGS), labels, 0.95),
+        table2_latex({"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})}),
+    ]
+
+
+@pytest.mark.parametrize(
+    "fragment", fragments(), ids=["table1", "one seed", "supplement", "table2"]
+)
+def test_the_latex_is_balanced(fragment):
+    assert fragment.isascii()
+    bare = re.sub(r"\\[\\{}]", "", fragment)
+    assert bare.count("{") == bare.count("}")
+    stack = []
+    for kind, name in re.findall(r"\\(begin|end)\{([a-z*]+)\}", fragment):
+        if kind == "begin":
+            stack.append(name)
+        else:
+            assert stack.pop() == name
+    assert not stack
+    body = re.sub(r"(?s)\\begin\{tabular\}\[t\].*?\\end\{tabular\}", "", fragment)
+    for part in re.findall(r"(?s)\\toprule\n(.*?)\\bottomrule", body):
+        rows = [row for row in part.splitlines() if "&" in row]
+        assert len({len(re.findall(r"(?<!\\)&", row)) for row in rows}) == 1
+    # After \\ a bracket would be read as an optional argument.
+    assert not re.search(r"\\\\\s*[\[*]", fragment)
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
+@pytest.mark.parametrize(
+    "fragment", fragments(), ids=["table1", "one seed", "supplement", "table2"]
+)
+def test_pdflatex_compiles_it_within_the_margins(fragment, tmp_path):
+    document = (
+        "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n"
+        f"{fragment}\\end{{document}}\n"
+    )
+    (tmp_path / "page.tex").write_text(document)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout
+    assert "Overfull \\hbox" not in run.stdout
+    assert "Missing character" not in run.stdout
