@@ -1,4 +1,4 @@
-"""The command `mace-rl`: one training run by hand."""
+"""The command `mace-rl`: one training run by hand, and repeating runs that were kept."""
 
 import argparse
 import json
@@ -8,6 +8,8 @@ from pathlib import Path
 
 from mace_rl.hyperparameters import ConfigError, RunConfig
 from mace_rl.study import read_study
+
+logger = logging.getLogger(__name__)
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 
@@ -30,6 +32,15 @@ def parser() -> argparse.ArgumentParser:
         "--config", type=Path, help="a YAML file read over the project's config.yaml"
     )
     train.add_argument("--out", required=True, type=Path, help="folder for the results")
+    verify = commands.add_parser(
+        "verify",
+        allow_abbrev=False,
+        help="repeat kept runs and compare to the bit",
+        description="Repeat runs that were kept and say whether they come out the same.",
+    )
+    verify.add_argument("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
+    verify.add_argument("--sample", type=int, help="how many, chosen at random (default: all)")
+    verify.add_argument("--sample-seed", type=int, default=0, help="which ones (default: 0)")
     return top
 
 
@@ -61,23 +72,40 @@ def finished(config: RunConfig, directory: Path) -> bool:
     return True
 
 
+def train(arguments: argparse.Namespace) -> None:
+    """`mace-rl train`."""
+    config = run_config(arguments)
+    if finished(config, arguments.out):
+        logger.info("%s holds this run already, finished", arguments.out)
+        return
+    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
+    from mace_rl import run
+
+    run.run(config, arguments.out)
+    logger.info("finished: %s", arguments.out / "episodes.csv")
+
+
+def verify(arguments: argparse.Namespace) -> None:
+    """`mace-rl verify`."""
+    from mace_rl import verify
+
+    if arguments.sample is not None and arguments.sample < 1:
+        raise ConfigError(f"--sample is {arguments.sample}, but should be at least 1")
+    confidence = read_study([CONFIG]).metrics.confidence
+    for line in verify.verify(
+        arguments.folder, arguments.sample, arguments.sample_seed, confidence
+    ):
+        print(line, flush=True)
+
+
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
     arguments = parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    log = logging.getLogger("mace-rl")
     try:
-        config = run_config(arguments)
-        if finished(config, arguments.out):
-            log.info("%s holds this run already, finished", arguments.out)
-            return
-        # Imported here: PyTorch takes seconds, and a mistake in the command should not.
-        from mace_rl import run
-
-        run.run(config, arguments.out)
-        log.info("finished: %s", arguments.out / "episodes.csv")
-    except (ConfigError, RuntimeError, ArithmeticError, OSError) as error:
-        sys.exit(f"mace-rl: {error}")
+        {"train": train, "verify": verify}[arguments.command](arguments)
+    except (ValueError, RuntimeError, ArithmeticError, OSError) as error:
+        sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
-        log.info("interrupted; the same command resumes it")
+        logger.info("interrupted; the same command resumes it")
         sys.exit(130)

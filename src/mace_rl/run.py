@@ -50,6 +50,8 @@ def run(config: RunConfig, directory: Path) -> None:
     torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
     with exclusive(directory), threadpool_limits(1):
+        for half_written in directory.glob(".*.tmp"):  # by a process that was killed
+            half_written.unlink()
         started = time.monotonic()
         trainer = Trainer(config)
         identity = run_identity(config)

@@ -1,0 +1,33 @@
+"""From the configuration to Table 1 and Figure 1: train, measure, tabulate, draw.
+
+    snakemake -j2 all                                      the paper's budgets (hours)
+    snakemake -j2 all --configfile config/reduced.yaml     the same at small budgets (minutes)
+
+Defaults of the command line are in profiles/default/config.yaml.
+"""
+
+
+configfile: "config.yaml"
+
+
+include: "workflow/rules/study.smk"
+
+
+rule all:
+    input:
+        f"{RESULTS}/metrics.csv",
+        f"{RESULTS}/table1.tex",
+        f"{RESULTS}/table1.csv",
+        f"{RESULTS}/supplement.tex",
+        f"{RESULTS}/supplement.csv",
+        f"{RESULTS}/table2.tex",
+        f"{RESULTS}/figure1.pdf",
+        f"{RESULTS}/figure1.png",
+        f"{RESULTS}/figure1.csv",
+
+
+include: "workflow/rules/train.smk"
+include: "workflow/rules/metrics.smk"
+include: "workflow/rules/tables.smk"
+include: "workflow/rules/figures.smk"
+include: "workflow/rules/terminal.smk"

@@ -1,0 +1,199 @@
+"""The bonus: novelty × relevance, and relevance in the three cases the paper tells apart."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from mace_rl.curiosity import Curiosity, relevance
+from mace_rl.environments import Environment
+from mace_rl.memory import Recollection
+from mace_rl.rollout import Episode
+
+RETURNS = torch.tensor([-20.0, -10.0, 0.0, 10.0, 20.0])  # mean 0, standard deviation √200
+
+
+def recollection(similarity: float, value: float) -> Recollection:
+    return Recollection(torch.tensor([[0.0, 0.0, value]]), torch.tensor([similarity]))
+
+
+def episode_of(states, rewards=None, terminated=True) -> Episode:
+    """An episode through `states`, [T + 1, observation]."""
+    states = np.asarray(states, np.float32)
+    length = len(states) - 1
+    return Episode(
+        observations=states,
+        actions=np.zeros(length, np.int64),
+        log_probs=np.zeros(length, np.float32),
+        rewards=np.zeros(length) if rewards is None else np.asarray(rewards, np.float64),
+        terminated=terminated,
+    )
+
+
+def wander(seed, centre=0.0, scale=0.3, length=30) -> Episode:
+    """Observations of CartPole's shape around `centre`."""
+    rng = np.random.default_rng(seed)
+    return episode_of(centre + scale * rng.standard_normal((length + 1, 4)))
+
+
+@pytest.fixture
+def make(run_config):
+    """`make(environment, **changes)`: curiosity as in a run of mace_full."""
+
+    def build(environment="CartPole-v1", **changes) -> Curiosity:
+        changes = {"memory": {"write_every": 1}, "novelty": {"write_every": 1}} | changes
+        config = run_config(environment, "mace_full", 0, **changes)
+        return Curiosity(config, Environment(environment, 0))
+
+    return build
+
+
+# --- Relevance ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [-1000.0, -20.0, 0.0, 20.0, 1000.0])
+def test_nothing_similar_is_fully_relevant(value):
+    assert float(relevance(recollection(0.0, value), RETURNS)) == 1
+
+
+def test_similar_and_unproductive_goes_to_0():
+    values = [float(relevance(recollection(1.0, v), RETURNS)) for v in (0, -20, -40, -100)]
+    assert values[0] == pytest.approx(0.5)
+    assert values == sorted(values, reverse=True)
+    assert values[1] < 0.2 and values[3] < 0.001
+
+
+def test_similar_and_productive_stays_near_1():
+    values = [float(relevance(recollection(1.0, v), RETURNS)) for v in (0, 20, 40, 100)]
+    assert values == sorted(values) and values[1] > 0.8 and values[3] > 0.999
+
+
+def test_relevance_by_hand():
+    # (10 − 0) / √200 = 0.7071; the logistic function of it is 0.66976; 1 − ½ (1 − 0.66976).
+    found = relevance(recollection(0.5, 10.0), RETURNS)
+    assert float(found) == pytest.approx(0.83488, abs=1e-5)
+
+
+def test_relevance_does_not_depend_on_the_unit_of_reward():
+    found = relevance(recollection(0.7, -7.0), RETURNS)
+    other = relevance(recollection(0.7, -0.07 + 5), RETURNS / 100 + 5)
+    assert float(found) == pytest.approx(float(other), abs=1e-4)
+
+
+def test_relevance_is_within_0_and_1_even_if_all_returns_are_equal():
+    for returns in (torch.zeros(5), torch.full((1,), 3.0), RETURNS):
+        for similarity in (0.0, 0.3, 1.0):
+            for value in (-1e6, 0.0, 3.0, 1e6):
+                assert 0 <= float(relevance(recollection(similarity, value), returns)) <= 1
+
+
+# --- The bonus ----------------------------------------------------------------------------------
+
+
+def test_first_episode_is_wholly_new(make):
+    assert make().bonus(wander(0)).tolist() == [1.0] * 30
+
+
+def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
+    """Both factors recomputed from the parts on their own, before they take the episode in."""
+    curiosity = make()
+    for seed in range(5):
+        episode = wander(seed)
+        curiosity.remember(episode, np.random.default_rng(seed).standard_normal(30))
+    episode = wander(9, scale=0.6)
+    arrived = episode.observations[1:]
+    apart = copy.deepcopy(curiosity)
+    novelty = apart.novelty(arrived)
+    entries = apart.memory.usage > 0
+    mean, std = apart.embedding.mean, apart.embedding.std
+    keys, values = apart.memory.keys[entries].numpy(), apart.memory.values[entries].numpy()
+    found = curiosity.bonus(episode)
+    for t, state in enumerate(arrived):
+        squares = (((state - mean) / std - (keys - mean) / std) ** 2).mean(1)
+        nearest = np.argsort(squares)[:10]
+        kernel = 1 / (squares[nearest] + 0.1)
+        recalled = (kernel * values[nearest, -1]).sum() / kernel.sum()
+        z = (recalled - values[:, -1].mean()) / values[:, -1].std()
+        relevant = 1 - 0.1 * kernel.max() * (1 - 1 / (1 + np.exp(-z)))
+        assert found[t] == pytest.approx(novelty[t] * relevant, rel=1e-3)
+
+
+def test_bonus_is_for_the_state_reached_and_the_start_does_not_count(make):
+    curiosity = make()
+    for seed in range(5):
+        curiosity.remember(wander(seed), np.zeros(30))
+    episode = wander(9)
+    moved = wander(9)
+    moved.observations[0] += 100
+    assert (curiosity.bonus(episode) == curiosity.bonus(moved)).all()
+    moved.observations[-1] += 100
+    assert (curiosity.bonus(moved)[:-1] == curiosity.bonus(episode)[:-1]).all()
+    assert curiosity.bonus(moved)[-1] > 0.99
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
+def test_bonus_is_within_0_and_1(make, name):
+    curiosity = make(name)
+    rng = np.random.default_rng(0)
+    for seed in range(25):
+        if name == "CartPole-v1":
+            episode = wander(seed, centre=0.2 * seed, scale=10.0 ** (seed % 4 - 2))
+        else:
+            episode = episode_of(np.eye(16)[rng.integers(16, size=31)])
+        bonus = curiosity.bonus(episode)
+        assert bonus.shape == (30,) and bonus.dtype == np.float64
+        assert ((bonus >= 0) & (bonus <= 1)).all()
+        curiosity.remember(episode, 50 * rng.standard_normal(30))
+
+
+def test_familiar_and_unproductive_states_earn_least(make):
+    """Two places equally often visited, one with high returns; and a third never seen."""
+    curiosity = make()
+    for seed in range(10):
+        curiosity.remember(wander(seed, centre=-1.0), np.full(30, -50.0))
+        curiosity.remember(wander(100 + seed, centre=1.0), np.full(30, 50.0))
+    poor, rich, unseen = (
+        curiosity.bonus(wander(50, centre=centre)).mean() for centre in (-1.0, 1.0, 8.0)
+    )
+    assert poor < 0.5 * rich < rich < 0.6 < 0.95 < unseen
+
+
+def test_remembering_stores_one_step_in_write_every(make):
+    curiosity = make(memory={"write_every": 4})
+    episode = episode_of(np.arange(44).reshape(11, 4), rewards=range(10))
+    curiosity.remember(episode, np.arange(10) * 10.0)
+    assert len(curiosity.memory) == 3
+    stored = curiosity.memory.values[:3].numpy()
+    assert (curiosity.memory.keys[:3].numpy() == episode.observations[[0, 4, 8]]).all()
+    assert (stored[:, :4] == episode.observations[[1, 5, 9]]).all()
+    assert stored[:, 4:].tolist() == [[0, 0], [4, 40], [8, 80]]
+
+
+def test_appraisal_comes_before_remembering(make):
+    """An episode is rewarded for what was known before it: asking changes nothing known."""
+    curiosity = make()
+    curiosity.remember(wander(0), np.zeros(30))
+    assert (curiosity.bonus(wander(1)) == curiosity.bonus(wander(1))).all()
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
+def test_restored_curiosity_continues_to_the_bit(make, name):
+    original, restored = make(name), make(name)
+    rng = np.random.default_rng(0)
+
+    def episode() -> Episode:
+        if name == "CartPole-v1":
+            return wander(int(rng.integers(1000)))
+        return episode_of(np.eye(16)[rng.integers(16, size=31)])
+
+    for _ in range(4):
+        original.bonus(played := episode())
+        original.remember(played, rng.standard_normal(30))
+    restored.load_state_dict(copy.deepcopy(original.state_dict()))
+    for _ in range(4):
+        played, returns = episode(), rng.standard_normal(30)
+        assert (original.bonus(played) == restored.bonus(played)).all()
+        original.remember(played, returns)
+        restored.remember(played, returns)
+    assert (original.memory.usage == restored.memory.usage).all()

@@ -1,0 +1,181 @@
+"""Kill trainings and whole workflows at bad moments, start them again, and compare to the bit.
+
+    .venv/bin/python tools/kill_test.py [--repeats N] [--seed S]        (make kill-test)
+
+Every environment and variant of config.yaml is trained once undisturbed. Then, for each, a training
+is killed (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its
+results, and the same command is given again. At last a small workflow gets SIGINT, SIGTERM and
+SIGKILL. What is there in the end has to equal the undisturbed run byte for byte, with nothing left.
+"""
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+ENVIRONMENTS = ("Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0")
+VARIANTS = ("ppo", "mace_fixed", "mace_full")
+EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
+# Checkpoints as fast as they can be written: the moments to hit are then all through the training.
+TRAIN = "import mace_rl.run as r; r.CHECKPOINT_SECONDS = 0.05; r.CHECKPOINT_COST = 1.0; "
+TRAIN += "from mace_rl.cli import main; main()"
+RESULTS = {"agent.pt", "episodes.csv", "run.json"}
+
+
+def start(environment: str, variant: str, folder: Path) -> subprocess.Popen:
+    """Begin a training in `folder`, in a process of its own."""
+    command = [sys.executable, "-c", TRAIN, "train", "--env", environment, "--variant", variant]
+    command += ["--seed", "0", "--episodes", str(EPISODES[environment]), "--out", str(folder)]
+    return subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ
+    )
+
+
+def finish(process: subprocess.Popen) -> None:
+    """Wait for a training; exit with what it said if it failed."""
+    _, error = process.communicate()
+    if process.returncode != 0:
+        sys.exit(f"kill test: a training failed: {error.decode().strip().splitlines()[-1]}")
+
+
+def names(folder: Path) -> set[str]:
+    """What is in `folder`, if it exists yet."""
+    return set(os.listdir(folder)) if folder.exists() else set()
+
+
+def begun(folder: Path) -> bool:
+    """Whether the training in `folder` has saved its first checkpoint."""
+    return "checkpoint.pt" in names(folder)
+
+
+def writing_checkpoint(folder: Path) -> bool:
+    """Whether a checkpoint is half written at this moment."""
+    found = names(folder)
+    return "checkpoint.pt" in found and any(name.startswith(".checkpoint.pt.") for name in found)
+
+
+def writing_results(folder: Path) -> bool:
+    """Whether some but not all results are there at this moment."""
+    found = names(folder)
+    return (
+        any(name.startswith((".agent.pt.", ".episodes.csv.", ".run.json.")) for name in found)
+        or 0 < len(found & RESULTS) < 3
+    )
+
+
+def kill_when(
+    process: subprocess.Popen, folder: Path, moment: Callable[[Path], bool], delay: float
+) -> bool:
+    """SIGKILL `process` `delay` seconds after `moment` came; False if it ended before."""
+    while process.poll() is None:
+        if moment(folder):
+            time.sleep(delay)
+            process.kill()
+            process.communicate()
+            return process.returncode == -signal.SIGKILL
+    return False
+
+
+def same(folder: Path, undisturbed: Path) -> bool:
+    """Whether `folder` ends with the same records and agent as `undisturbed`, and no leftovers."""
+    return names(folder) == RESULTS and all(
+        (folder / name).read_bytes() == (undisturbed / name).read_bytes()
+        for name in ("episodes.csv", "agent.pt")
+    )
+
+
+def kill_trainings(scratch: Path, repeats: int, generator: random.Random) -> list[bool]:
+    """Kill every environment's and variant's training at every kind of moment."""
+    outcomes = []
+    for environment, variant in product(ENVIRONMENTS, VARIANTS):
+        undisturbed = scratch / f"{environment}-{variant}"
+        began = time.monotonic()
+        process = start(environment, variant, undisturbed)
+        while not begun(undisturbed) and process.poll() is None:
+            time.sleep(0.01)
+        training = time.monotonic()
+        finish(process)
+        length = time.monotonic() - training
+        moments = {
+            "training": (begun, lambda length=length: generator.uniform(0, 0.8 * length)),
+            "writing a checkpoint": (writing_checkpoint, lambda: 0.0),
+            "writing the results": (writing_results, lambda: 0.0),
+        }
+        for repeat, (name, (moment, delay)) in product(range(repeats), moments.items()):
+            folder = scratch / f"{environment}-{variant}-{name}-{repeat}"
+            process = start(environment, variant, folder)
+            killed = kill_when(process, folder, moment, delay())
+            finish(start(environment, variant, folder))
+            outcomes.append(killed and same(folder, undisturbed))
+            result = "equal" if outcomes[-1] else "DIFFERENT" if killed else "NOT HIT"
+            print(f"{environment} {variant}, killed while {name}: {result}", flush=True)
+        print(f"  ({time.monotonic() - began:.0f} s)", flush=True)
+    return outcomes
+
+
+def kill_workflows(scratch: Path) -> list[bool]:
+    """Interrupt a small workflow by three signals; each time the same command has to finish it."""
+    outcomes = []
+    settings = scratch / "small.yaml"
+    tables = {}
+    for name, sent in [
+        ("none", None),
+        *((s.name, s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)),
+    ]:
+        results = scratch / f"workflow-{name}"
+        settings.write_text(
+            f"results: {results}\nenvironments: [CartPole-v1, Acrobot-v1]\nseeds: [0]\n"
+            "training: {episodes: 150}\n",
+            encoding="utf-8",
+        )
+        command = [sys.executable, "-m", "snakemake", "-j2", "all", "--configfile", str(settings)]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
+        if sent:
+            process = subprocess.Popen(command, start_new_session=True, **quiet)
+            while process.poll() is None and not list(results.glob("runs/*/*/*/progress.json")):
+                time.sleep(0.05)
+            if sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
+                os.killpg(process.pid, sent)
+            else:
+                process.send_signal(sent)
+            process.wait()
+            time.sleep(3)  # jobs of a killed Snakemake notice and end
+        again = subprocess.run(command, **quiet, check=False)
+        tables[name] = {
+            path.relative_to(results): path.read_bytes()
+            for pattern in ("runs/*/*/*/episodes.csv", "metrics.csv", "table1.*", "figure1.csv")
+            for path in sorted(results.glob(pattern))
+        }
+        if sent:
+            outcomes.append(again.returncode == 0 and tables[name] == tables["none"])
+            print(f"workflow, {name}: {'equal' if outcomes[-1] else 'DIFFERENT'}", flush=True)
+    return outcomes
+
+
+def main() -> None:
+    """Run everything; exit with 1 unless every outcome is equal."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=1, help="kills of each kind (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random moments (default: 0)")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        trainings = kill_trainings(scratch, arguments.repeats, random.Random(arguments.seed))
+        workflows = kill_workflows(scratch)
+    print(
+        f"{sum(trainings)} of {len(trainings)} killed trainings and {sum(workflows)} of "
+        f"{len(workflows)} interrupted workflows ended with equal bits"
+    )
+    sys.exit(not all(trainings + workflows))
+
+
+if __name__ == "__main__":
+    main()

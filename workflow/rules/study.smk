@@ -1,0 +1,68 @@
+# The study as the configuration describes it, checked, and what all rules share of it.
+
+import os
+import re
+import sys
+from itertools import product
+from pathlib import Path
+
+import gymnasium
+from mace_rl import provenance
+from mace_rl.hyperparameters import ConfigError
+from mace_rl.sources import digest
+from mace_rl.study import load_study, merge, read_yaml, typed
+
+try:
+    files = [os.path.relpath(file) for file in workflow.configfiles]
+    origin = " + ".join(files[-1:] + files[:-1])  # Snakemake lists its own config.yaml last
+    for file in files:
+        read_yaml(Path(file))  # sees what Snakemake's reader does not: a key that occurs twice
+    # Snakemake takes the numbers in `--config seeds=[0,1]` for text.
+    given = {key: typed(value) for key, value in workflow.config_settings.config.items()}
+    study = load_study(merge(config, given), origin)
+except ConfigError as error:
+    sys.exit(f"Error in the configuration: {error}")
+
+RESULTS = os.path.normpath(study.results)
+RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
+RUNS = list(product(study.environments, study.variants, study.seeds))
+EPISODES = [f"{RUN}/episodes.csv".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
+BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
+
+
+def one_of(values):
+    """A pattern that matches exactly these values."""
+    return "|".join(re.escape(str(value)) for value in values)
+
+
+wildcard_constraints:
+    env=one_of(study.environments),
+    variant=one_of(study.variants),
+    seed=one_of(study.seeds),
+
+
+def run_config(wildcards):
+    """All that determines a run besides the code."""
+    return study.run_config(wildcards.env, wildcards.variant, int(wildcards.seed))
+
+
+def most_work(wildcards):
+    """A measure of how long a run can take: long ones start first, and no core idles at the end."""
+    config = run_config(wildcards)
+    steps = config.episodes * gymnasium.registry[config.environment].max_episode_steps
+    return steps if config.beta.kind == "none" else 2 * steps
+
+
+def selected(by_variant):
+    """The entries of the selected variants only: no other can call for a new table or figure."""
+    return {variant: by_variant[variant] for variant in study.variants}
+
+
+def code(script):
+    """Digest of a script and of all that it imports of mace_rl, for the `params:` of its rule.
+
+    That makes a change of code, by content, a reason to run the job again. As an input it would
+    not: Snakemake goes by an input's time stamp first, and records what it contained when the job
+    ended, so code that was edited meanwhile would pass for the code that ran.
+    """
+    return digest(Path(workflow.basedir, "workflow", "scripts", script))

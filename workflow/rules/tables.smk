@@ -1,0 +1,41 @@
+# The paper's tables.
+
+
+rule table1:
+    input:
+        f"{RESULTS}/metrics.csv",
+    output:
+        table1=report(f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"),
+        table1_data=report(
+            f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"
+        ),
+        supplement=f"{RESULTS}/supplement.tex",
+        supplement_data=report(
+            f"{RESULTS}/supplement.csv", caption="../report/supplement.rst", category="Supplement"
+        ),
+    log:
+        f"{RESULTS}/logs/table1.log",
+    params:
+        environments=study.environments,
+        variants=study.variants,
+        seeds=study.seeds,
+        settings=study.metrics.model_dump(),
+        labels=selected(study.labels),
+        code=code("table1.py"),
+    script:
+        "../scripts/table1.py"
+
+
+rule table2:
+    output:
+        report(f"{RESULTS}/table2.tex", caption="../report/table2.rst", category="Methods"),
+    log:
+        f"{RESULTS}/logs/table2.log",
+    params:
+        ppo={
+            env: study.run_config(env, study.variants[0], 0).ppo.model_dump()
+            for env in study.environments
+        },
+        code=code("table2.py"),
+    script:
+        "../scripts/table2.py"

@@ -1,0 +1,22 @@
+"""metrics.csv: what is measured on each run."""
+
+from job import job
+
+with job("metrics", snakemake.log[0]):
+    from mace_rl.files import write_atomically
+    from mace_rl.metrics import MetricsConfig, metrics_table
+    from mace_rl.records import read_episodes
+
+    params = snakemake.params
+    runs = {
+        (env, variant, seed): read_episodes(path, episodes)
+        for path, (env, variant, seed, episodes) in zip(snakemake.input, params.runs, strict=True)
+    }
+    table = metrics_table(
+        runs,
+        params.environments,
+        params.variants,
+        params.seeds,
+        MetricsConfig.model_validate(params.settings),
+    )
+    write_atomically(snakemake.output[0], table.to_csv(index=False))
