@@ -13,6 +13,16 @@ configfile: "config.yaml"
 include: "workflow/rules/study.smk"
 
 
+# On a cluster these are not worth a place in the queue: seconds of work each.
+localrules:
+    all,
+    metrics,
+    table1,
+    table2,
+    curves,
+    figure1,
+
+
 rule all:
     input:
         f"{RESULTS}/metrics.csv",

@@ -1,5 +1,6 @@
 """FastHopperBulletEnv against the library's HopperBulletEnv: every bit, at every step."""
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -54,7 +55,8 @@ def attributes(env: HopperBulletEnv) -> tuple:
     robot = env.robot
     return (
         *(v.tobytes() for v in (robot.joint_speeds, robot.feet_contact, robot.body_real_xyz)),
-        *(robot.body_xyz, robot.body_rpy, robot.initial_z, robot.joints_at_limit),
+        *(robot.body_xyz, robot.body_rpy, robot.joints_at_limit),
+        *(robot.initial_z, type(robot.initial_z)),  # numpy's, which the library's step relies on
         *(robot.walk_target_theta, robot.walk_target_dist),
         *(env.potential, env.reward, env.frame, env.done),
     )
@@ -162,6 +164,25 @@ def test_same_bits_away_from_the_plane(pair) -> None:
         for _ in range(30):
             step_both(*pair, rng.uniform(-1, 1, 3).astype(np.float32))
         assert pair[0].robot.body_xyz[1] != 0 != pair[0].robot.body_rpy[2]
+
+
+def test_towards_target_whatever_the_signs_of_zero() -> None:
+    special = [0.0, -0.0, 1.5, -2.7, np.inf, np.nan]
+    angles = [0.0, -0.0, np.pi, -0.3]
+    for dx, dy, yaw in itertools.product([999.7, -3.1], [0.0, -0.0, 0.1], angles):
+        theta = np.arctan2(dy, dx)
+        turn = np.array(
+            [[np.cos(-yaw), -np.sin(-yaw), 0], [np.sin(-yaw), np.cos(-yaw), 0], [0, 0, 1]]
+        )
+        angle = theta - yaw
+        place = [theta, np.linalg.norm([dy, dx]), np.sin(angle), np.cos(angle)]
+        for speed in itertools.product(special, repeat=3):
+            with np.errstate(invalid="ignore"):
+                expected = np.array([*place, *np.dot(turn, np.array(speed))])
+                found = np.array(hopper.towards_target(dx, dy, yaw, *speed))
+            np.testing.assert_array_equal(found, expected)
+            zero = expected == 0
+            np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
 
 
 @pytest.mark.parametrize("speed", [1e3, -1e6, np.nan])

@@ -180,6 +180,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "results folder that is no text": ({"results": 5}, ["results", "5", "string"]),
     "results folder without a name": ({"results": " "}, ["results", "' '", "folder"]),
     "results folder with a pattern": ({"results": "r/{env}"}, ["results", "'r/{env}'", "folder"]),
+    "results folder in a file": ({"results": __file__ + "/x"}, ["results", __file__, "is a file"]),
     "key that is no text": ({7: 8}, ["'7'", "unknown"]),
 }
 

@@ -1,6 +1,8 @@
 """The workflow for real, at tiny budgets, in a copy of the project."""
 
+import fcntl
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -110,7 +112,7 @@ def edit(finished: Project) -> Iterator:
 
     def replace(name: str, old: str, new: str) -> None:
         file = finished[name]
-        before[file] = file.read_bytes(), file.stat()
+        before.setdefault(file, (file.read_bytes(), file.stat()))
         text = file.read_text(encoding="utf-8")
         assert old in text
         file.write_text(text.replace(old, new, 1), encoding="utf-8")
@@ -262,33 +264,52 @@ def test_lists_on_the_command_line_are_lists_of_numbers(finished: Project) -> No
 
 
 @pytest.mark.slow
-def test_one_snakemake_at_a_time_and_the_same_command_after_a_kill(tmp_path: Path) -> None:
+def test_one_snakemake_at_a_time(finished: Project, edit) -> None:
+    edit("config.yaml", "tab:blue", "tab:cyan")  # something to do
+    with finished["results/tiny/.lock"].open("w") as lock:
+        lock.write("Snakemake (process 7 on moon)")
+        lock.flush()
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = finished.snakemake("-j2", "all")
+        assert done.returncode == 1
+        refusal = "Error: Snakemake (process 7 on moon) is at work in results/tiny; wait for it"
+        assert refusal in done.stdout.splitlines()
+        assert finished.planned() == {"figure1": 1}  # looking is allowed
+
+
+@pytest.mark.slow
+def test_the_same_command_after_a_kill(tmp_path: Path) -> None:
     project = Project(tmp_path)
-    study = STUDY | {"environments": ["Acrobot-v1"], "training": {"episodes": 100}}
+    study = STUDY | {
+        "environments": ["Acrobot-v1"],
+        "variants": ["mace_full"],
+        "training": {"episodes": 150},
+    }
     project["tiny.yaml"].write_text(yaml.safe_dump(study))
-    runs = [
-        project[f"results/tiny/runs/Acrobot-v1/{variant}/seed0"] for variant in STUDY["variants"]
-    ]
-    first = subprocess.Popen(
-        project.command("-j2", "all"),
-        cwd=tmp_path,
-        env=project.environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    progress = project["results/tiny/runs/Acrobot-v1/mace_full/seed0/progress.json"]
+    with project["first.log"].open("w") as log:
+        first = subprocess.Popen(
+            project.command("-j2", "all"),
+            cwd=tmp_path,
+            env=project.environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
     deadline = time.monotonic() + 200
-    while not all((run / "progress.json").exists() for run in runs):
-        assert first.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
-    second = project.snakemake("-j2", "all")
-    assert second.returncode == 1
-    refusal = f"Error: Snakemake (process {first.pid} on "
-    assert any(line.startswith(refusal) for line in second.stdout.splitlines())
+    while not progress.exists():
+        assert first.poll() is None and time.monotonic() < deadline, project[
+            "first.log"
+        ].read_text()
+        time.sleep(0.05)
+    training = json.loads(progress.read_text())["pid"]
+    with project["results/tiny/.lock"].open() as lock, pytest.raises(BlockingIOError):
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     first.send_signal(signal.SIGKILL)
     first.wait()
-    third = project.snakemake("-j2", "all")
-    assert third.returncode == 0, third.stdout
-    assert "2 of 2 runs done" in third.stdout
+    again = project.snakemake("-j2", "all")
+    assert again.returncode == 0, again.stdout
+    assert "1 of 1 runs done" in again.stdout
+    assert not Path(f"/proc/{training}").exists()  # the killed Snakemake's training has ended
     assert project.planned() == {}
 
 
@@ -302,7 +323,7 @@ def test_planning_three_thousand_runs(tmp_path: Path) -> None:
     }
     project["tiny.yaml"].write_text(yaml.safe_dump(study))
     start = time.monotonic()
-    jobs = project.planned("--quiet")
+    jobs = project.planned()
     print(f"planning 3,000 runs took {time.monotonic() - start:.1f} s")
     assert jobs == {"train": 3000, "table2": 1, **EVALUATION}
 

@@ -109,3 +109,7 @@ def main() -> None:
     except KeyboardInterrupt:
         logger.info("interrupted; the same command resumes it")
         sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -58,6 +58,24 @@ def is_plus_zero(v: float) -> bool:
     return v == 0.0 < math.copysign(1.0, v)
 
 
+def towards_target(
+    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """The target's direction and distance, sin and cos of the angle to it, speed turned by -yaw."""
+    in_plane = yaw == dy == 0.0 < dx and is_plus_zero(vy) and math.isfinite(vx + vz)
+    if in_plane and (vx or is_plus_zero(yaw)):
+        # Every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
+        # cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. So it is until the hopper has fallen.
+        return dy, dx, dy - yaw, 1.0, vx + 0.0, 0.0, vz + 0.0
+    theta = np.arctan2(dy, dx)
+    target = np.array((dy, dx))
+    sin, cos = np.sin(-yaw), np.cos(-yaw)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    speed = np.dot(rotation, np.array((vx, vy, vz))).tolist()
+    angle = theta - yaw
+    return theta, math.sqrt(target.dot(target)), float(np.sin(angle)), float(np.cos(angle)), *speed
+
+
 class FastHopperBulletEnv(HopperBulletEnv):
     """The library's `HopperBulletEnv`: same constructor, spaces, numbers and random stream.
 
@@ -208,20 +226,7 @@ class FastHopperBulletEnv(HopperBulletEnv):
             robot.initial_z = np.float64(z)  # numpy's, lest the library's step add in float32
 
         dx, dy = robot.walk_target_x - x, robot.walk_target_y - y
-        in_plane = yaw == dy == 0.0 < dx and is_plus_zero(vy) and math.isfinite(vx + vz)
-        if in_plane and (vx or is_plus_zero(yaw)):
-            # Every product with y, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
-            # cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. Holds until the hopper has fallen.
-            theta, distance, sin_angle, cos_angle = 0.0, dx, 0.0, 1.0
-            vx, vz = vx + 0.0, vz + 0.0
-        else:
-            theta = np.arctan2(dy, dx)
-            to_target = np.array((dy, dx))
-            distance = math.sqrt(to_target.dot(to_target))
-            sin_angle, cos_angle = float(np.sin(theta - yaw)), float(np.cos(theta - yaw))
-            sin, cos = np.sin(-yaw), np.cos(-yaw)
-            rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-            vx, vy, vz = np.dot(rotation, np.array((vx, vy, vz))).tolist()
+        theta, distance, sin, cos, vx, vy, vz = towards_target(dx, dy, yaw, vx, vy, vz)
         robot.walk_target_theta, robot.walk_target_dist = theta, distance
 
         j = []  # each joint's position within its range, from -1 to 1, and a tenth of its speed
@@ -232,8 +237,7 @@ class FastHopperBulletEnv(HopperBulletEnv):
         q1, _, q2, _, q3, _ = joint_state.tolist()
         robot.joints_at_limit = (abs(q1) > AT_LIMIT) + (abs(q2) > AT_LIMIT) + (abs(q3) > AT_LIMIT)
 
-        more = [z - float(robot.initial_z), sin_angle, cos_angle]
-        more += (0.3 * vx, 0.3 * vy, 0.3 * vz, roll, pitch)
+        more = [z - float(robot.initial_z), sin, cos, 0.3 * vx, 0.3 * vy, 0.3 * vz, roll, pitch]
         # 5 is a float32, so clipping may come before rounding to float32. A NaN stays NaN.
         values = [
             v if -5.0 <= v <= 5.0 else 5.0 if v > 5.0 else max(v, -5.0)

@@ -156,6 +156,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
             return f"the key {key!r} is missing"
         case _:
             reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+            reason = reason.replace(" after validation, not 0", "")
             return f"{key} is {value}, but {reason}"
 
 

@@ -217,7 +217,7 @@ def duration(seconds: float) -> str:
 def start(runs: Iterable[Run], cores: int, local: bool) -> "subprocess.Popen[str]":
     """Start a process that reports on `runs` until `stop`, or until this process ends."""
     monitor = subprocess.Popen(
-        [sys.executable, "-m", "mace_rl.progress"], stdin=subprocess.PIPE, text=True
+        [f"{sys.prefix}/bin/python", "-m", "mace_rl.progress"], stdin=subprocess.PIPE, text=True
     )
     assert monitor.stdin is not None
     task = {"runs": [asdict(run) for run in runs], "cores": cores, "local": local}

@@ -34,6 +34,8 @@ PROGRESS_SECONDS = 2.0
 # A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
 CHECKPOINT_SECONDS = 10.0
 CHECKPOINT_COST = 0.01
+# A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
+LOCK_SECONDS = 5.0
 
 
 class RunError(RuntimeError):
@@ -142,12 +144,23 @@ def exclusive(directory: Path) -> Iterator[None]:
     """Hold the run's folder for this process; the lock goes with the process, however it ends."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        patience = time.monotonic() + LOCK_SECONDS
+        while not locked(descriptor):
+            if time.monotonic() > patience:
+                raise RunError(f"{directory}: another process is training in this folder")
+            time.sleep(0.1)
         yield
-    except BlockingIOError:
-        raise RunError(f"{directory}: another process is training in this folder") from None
     finally:
         os.close(descriptor)
+
+
+def locked(descriptor: int) -> bool:
+    """Try to lock an open folder for this process."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def write_progress(directory: Path, trainer: Trainer, clock: Clock) -> None:

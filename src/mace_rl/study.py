@@ -230,6 +230,11 @@ def _check_results(results: str) -> None:
         raise ConfigError(
             f"results is {results!r}, but should be the path of a folder, without {{}}*?[]"
         )
+    for path in (Path(results), *Path(results).parents):
+        if path.exists() and not path.is_dir():
+            raise ConfigError(
+                f"results is {results!r}, but should be a folder, and {path} is a file"
+            )
 
 
 def _check_name(name: str, key: str) -> None:

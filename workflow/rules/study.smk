@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import sys
 from itertools import product
 from pathlib import Path
@@ -11,6 +12,9 @@ from mace_rl import provenance
 from mace_rl.hyperparameters import ConfigError
 from mace_rl.sources import digest
 from mace_rl.study import load_study, merge, read_yaml, typed
+
+# Snakemake pastes this path into the shell commands of `script:` jobs, where a space would split it.
+sys.executable = shlex.quote(sys.executable)
 
 try:
     files = [os.path.relpath(file) for file in workflow.configfiles]

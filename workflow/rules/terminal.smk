@@ -36,13 +36,15 @@ def occupy(folder):
 
     Snakemake's own lock, which profiles/default/config.yaml turns off, outlives a kill.
     """
-    os.makedirs(folder, exist_ok=True)
-    lock = open(f"{folder}/.lock", "a+", encoding="utf-8")
     try:
+        os.makedirs(folder, exist_ok=True)
+        lock = open(f"{folder}/.lock", "a+", encoding="utf-8")
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
         sys.exit(f"Error: {lock.read() or 'another Snakemake'} is at work in {folder}; wait for it")
+    except OSError as error:
+        sys.exit(f"Error: the results folder {folder} cannot be used: {error.strerror}")
     lock.truncate(0)
     lock.write(f"Snakemake (process {os.getpid()} on {platform.node()})")
     lock.flush()
