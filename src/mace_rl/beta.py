@@ -31,7 +31,8 @@ class BetaController(Protocol):
     def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """After each rollout, before the policy's update on it: the flat policy gradients.
 
-        extrinsic: g_E of the whole rollout; intrinsic: g_I of each of its episodes, in order.
+        extrinsic: g_E of the whole rollout; intrinsic: for each of its episodes, in order, the
+        derivative dg/dβ of the update's direction.
         """
 
     def state_dict(self) -> dict[str, Any]:
@@ -96,13 +97,13 @@ class MetaNetwork(nn.Module):
 class MetaAdaptation:
     """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
 
-    An update on episode n moves the policy by η (g_E + β_n g_I). How the extrinsic return of the
-    policy that results depends on β_n is therefore
+    The update on episode n moves the policy along g(β_n), the policy gradient of the total reward.
+    How the extrinsic return of the policy that results depends on β_n is therefore
 
-        dJ_E / dβ_n ≈ η ⟨g_E(θ'; episode n+1), g_I(θ; episode n)⟩
+        dJ_E / dβ_n ≈ η ⟨g_E(θ'; episode n+1), dg/dβ_n (θ; episode n)⟩
 
-    and by the chain rule through β_n = LSTM_φ(episode n-1) it trains φ. The two gradients are
-    scaled to length 1 first, which keeps the sign and leaves outliers no more weight than others.
+    and by the chain rule through β_n = LSTM_φ(episode n-1) it trains φ. g_E is scaled to length 1
+    and dg/dβ by the length of g, which is what gradient clipping and Adam make of the step.
     """
 
     learns = True
@@ -126,7 +127,7 @@ class MetaAdaptation:
         # What gave rise to the β of each episode since the last `learn`, and to that of the next;
         # None for the first episode, whose β is given.
         self.sources: deque[Tensor | None] = deque([None])
-        # The same with g_I for the episodes of the last rollout, whose effect is not yet known.
+        # The same with dg/dβ for the episodes of the last rollout, whose effect is not yet known.
         self.pending: list[tuple[Tensor | None, np.ndarray]] = []
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
@@ -197,7 +198,7 @@ class MetaAdaptation:
         self.pending = [(sequence, gradient.numpy()) for sequence, gradient in state["pending"]]
 
 
-def alignment(extrinsic: np.ndarray, intrinsic: np.ndarray) -> float:
-    """⟨g_E, g_I⟩ / (|g_E| |g_I|), in [-1, 1]; 0 where either is 0."""
-    lengths = np.sqrt((extrinsic @ extrinsic) * (intrinsic @ intrinsic))
-    return float(extrinsic @ intrinsic / lengths) if lengths > 0 else 0.0
+def alignment(extrinsic: np.ndarray, change: np.ndarray) -> float:
+    """The part of `change` along the extrinsic gradient: ⟨g_E, change⟩ / |g_E|; 0 if g_E is 0."""
+    length = np.linalg.norm(extrinsic)
+    return float(extrinsic @ change / length) if length > 0 else 0.0

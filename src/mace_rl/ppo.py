@@ -193,12 +193,17 @@ class PPO:
             self.config.entropy_coefficient / count,
         )
 
-    def policy_gradient(
-        self, observations: np.ndarray, actions: np.ndarray, advantage: np.ndarray
-    ) -> np.ndarray:
-        """∇_θ of the mean of log π(a|s) · A, float32 [n]; advantage: float32 [N]."""
-        weights = advantage / np.float32(len(advantage))
-        return self.actor.gradient(self.actor.forward(observations), actions, weights)
+    def policy_gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
+        activations = self.actor.forward(observations)
+        return [
+            self.actor.gradient(
+                activations, actions, (item / len(item)).astype(activations[-1].dtype)
+            )
+            for item in advantages
+        ]
 
     def _minibatches(self, size: int) -> Iterator[Any]:
         """Indices of each minibatch of each epoch; the whole batch in order if none are asked."""

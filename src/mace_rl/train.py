@@ -137,32 +137,31 @@ class Trainer:
         return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic)
 
     def adapt(self, rollout: list[Experience]) -> None:
-        """Meta-adaptation: show the network where extrinsic and intrinsic reward push the policy.
+        """Meta-adaptation: tell the controller what each β changes in the update, before it.
 
-        Both gradients are of the policy that played the rollout, before its update.
+        The update starts along the policy gradient of the normalised total advantage. Shown are its
+        derivative with respect to each episode's β, relative to its length, and the policy gradient
+        of the extrinsic advantage.
         """
         if not (self.controller and self.controller.learns):
             return
-        extrinsic = centred([item.extrinsic_advantages for item in rollout])
-        intrinsic = centred([item.intrinsic_advantages for item in rollout])
-        self.controller.learn(
-            self.ppo.policy_gradient(*steps(rollout), np.concatenate(extrinsic)),
+        extrinsic = np.concatenate([item.extrinsic_advantages for item in rollout])
+        total = total_advantages(rollout)
+        extrinsic_gradient, update, *changes = self.ppo.policy_gradients(
+            *steps(rollout),
             [
-                self.ppo.policy_gradient(*steps([item]), advantages)
-                for item, advantages in zip(rollout, intrinsic, strict=True)
+                extrinsic - extrinsic.mean(),
+                normalised(total),
+                *(normalised_change(total, change) for change in intrinsic_parts(rollout)),
             ],
+        )
+        length = np.linalg.norm(update)
+        self.controller.learn(
+            extrinsic_gradient, [change / length if length > 0 else change for change in changes]
         )
 
     def improve(self, rollout: list[Experience]) -> None:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        total = np.concatenate(
-            centred(
-                [
-                    item.extrinsic_advantages + item.beta * item.intrinsic_advantages
-                    for item in rollout
-                ]
-            )
-        )
         returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
         if self.curiosity:
             returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
@@ -170,7 +169,7 @@ class Trainer:
             Batch(
                 *steps(rollout),
                 log_probs=joined([item.episode.log_probs for item in rollout]),
-                advantages=total / (total.std() + np.float32(1e-8)),
+                advantages=normalised(total_advantages(rollout)).astype(np.float32),
                 returns=returns,
             )
         )
@@ -237,7 +236,32 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(pieces).astype(np.float32)
 
 
-def centred(advantages: list[np.ndarray]) -> list[np.ndarray]:
-    """The episodes' advantages minus their common mean, float32 [T] each."""
-    mean = np.concatenate(advantages).mean()
-    return [(item - mean).astype(np.float32) for item in advantages]
+def total_advantages(rollout: list[Experience]) -> np.ndarray:
+    """A_E + β A_I of every step, float64 [N]."""
+    return np.concatenate(
+        [item.extrinsic_advantages + item.beta * item.intrinsic_advantages for item in rollout]
+    )
+
+
+def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
+    """For each episode what `total_advantages` changes by with its β: A_I there, 0 elsewhere."""
+    parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
+    start = 0
+    for part, item in zip(parts, rollout, strict=True):
+        part[start : start + len(item.episode)] = item.intrinsic_advantages
+        start += len(item.episode)
+    return list(parts)
+
+
+def normalised(advantages: np.ndarray) -> np.ndarray:
+    """Advantages with mean 0 and standard deviation 1, [N]."""
+    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """d normalised(advantages + ε · change) / dε at ε = 0, [N].
+
+    What of the change is parallel to the advantages is lost in the normalisation.
+    """
+    centred, direction = change - change.mean(), normalised(advantages)
+    return (centred - direction * (direction * centred).mean()) / (advantages.std() + 1e-8)
