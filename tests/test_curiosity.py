@@ -170,6 +170,19 @@ def test_remembering_stores_one_step_in_write_every(make):
     assert stored[:, 4:].tolist() == [[0, 0], [4, 40], [8, 80]]
 
 
+def test_states_are_compared_in_the_standardisation_of_all_remembered(make):
+    """Discrete ones are one-hot and stay as they are."""
+    curiosity, states = make(), []
+    for seed in range(3):
+        curiosity.remember(wander(seed, centre=5.0, scale=2.0), np.zeros(30))
+        states += [*wander(seed, centre=5.0, scale=2.0).observations[1:].astype(np.float64)]
+    np.testing.assert_allclose(curiosity.embedding.mean, np.mean(states, axis=0))
+    np.testing.assert_allclose(curiosity.embedding.std, np.std(states, axis=0))
+    discrete = make("FrozenLake-v1")
+    discrete.remember(episode_of(np.eye(16)[[0, 4, 8, 9]]), np.zeros(3))
+    assert (discrete.embedding.mean == 0).all() and (discrete.embedding.std == 1).all()
+
+
 def test_appraisal_comes_before_remembering(make):
     """An episode is rewarded for what was known before it: asking changes nothing known."""
     curiosity = make()

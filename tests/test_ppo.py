@@ -203,14 +203,18 @@ def test_surrogate_is_flat_only_where_the_advantage_already_pushed(
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
-def test_policy_gradient_equals_autograd(make_ppo, twin, environment):
+def test_policy_gradients_equal_autograd(make_ppo, twin, environment):
     ppo = make_ppo(environment)
     batch = random_batch(ppo)
+    several = [batch.advantages, np.ones(40), batch.advantages.astype(np.float64) ** 2]
     other = twin(ppo.actor)
     log_probs = other.policy(batch.observations).log_prob(torch.from_numpy(batch.actions))
-    expected = other.gradient((log_probs * torch.from_numpy(batch.advantages)).mean())
-    found = ppo.policy_gradient(batch.observations, batch.actions, batch.advantages)
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+    found = ppo.policy_gradients(batch.observations, batch.actions, several)
+    for gradient, advantage in zip(found, several, strict=True):
+        mean = (log_probs * torch.from_numpy(advantage)).mean()
+        expected = torch.autograd.grad(mean, other.parameters(), retain_graph=True)
+        np.testing.assert_allclose(gradient, other.flat(expected), rtol=1e-3, atol=1e-5)
+        assert gradient.dtype == np.float32
 
 
 # --- Updates ------------------------------------------------------------------------------------

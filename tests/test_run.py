@@ -1,5 +1,6 @@
 """One run on disk: interrupted and resumed to the bit, what it refuses, what it leaves behind."""
 
+import fcntl
 import hashlib
 import json
 import logging
@@ -8,6 +9,8 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -144,8 +147,11 @@ run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
 
 
 @pytest.mark.slow
-def test_a_process_killed_by_sigkill_is_resumed_by_another(run_config, tmp_path, caplog):
+def test_a_process_killed_by_sigkill_is_resumed_by_another(
+    run_config, tmp_path, monkeypatch, caplog
+):
     """And while it lives, a second process in its folder is refused."""
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)
     config = run_config("HopperBulletEnv-v0", "mace_full", 5, episodes=20)
     directory = tmp_path / "Läufe mit Leerzeichen"
     command = [sys.executable, "-c", CHILD, config.model_dump_json(), str(directory)]
@@ -166,6 +172,18 @@ def test_a_process_killed_by_sigkill_is_resumed_by_another(run_config, tmp_path,
     run.run(config, tmp_path / "whole")
     assert outcome(directory) == outcome(tmp_path / "whole")
     assert provenance_of(directory)["interruptions"] == 1
+
+
+def test_a_dying_predecessor_is_waited_for(tmp_path):
+    """It holds the folder's lock for a moment after whoever started it is gone."""
+    holder = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    timer = threading.Timer(0.5, os.close, [holder])
+    started = time.monotonic()
+    timer.start()
+    with run.exclusive(tmp_path):
+        assert time.monotonic() - started >= 0.4
+    timer.join()
 
 
 def test_killed_before_the_results_are_complete(run_config, tmp_path, monkeypatch):

@@ -229,6 +229,33 @@ def test_rollout_ends_with_the_episode_that_fills_it(run_config):
     assert [record.length for record in trainer.records] == sum(rounds, [])  # noqa: RUF017
 
 
+def test_rollout_that_is_exactly_full_ends(run_config, register):
+    """Five steps an episode, ten a rollout: two episodes, not three."""
+    name = register("Bonanza-v0", Bonanza, 5)
+    config = run_config(name, "ppo", 0, episodes=7, ppo={"rollout_steps": 10})
+    assert [len(records) for records in Trainer(config).run()] == [2, 2, 2, 1]
+
+
+def test_each_reward_has_its_own_returns_and_critic(run_config, twin):
+    """With λ = 1 and an episode that terminates: the discounted sums, minus each critic's value."""
+    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=3))
+    for _ in range(3):
+        critics = {kind: twin(critic) for kind, critic in trainer.ppo.critics.items()}
+        (item,) = rollout = trainer.collect()
+        assert item.episode.terminated
+        for kind, rewards in (("extrinsic", item.episode.rewards), ("intrinsic", item.bonus)):
+            length = len(rewards)
+            returns = [
+                sum(0.99 ** (i - t) * rewards[i] for i in range(t, length)) for t in range(length)
+            ]
+            values = critics[kind](item.observations[:-1])[:, 0].detach().numpy()
+            found = getattr(item, f"{kind}_returns"), getattr(item, f"{kind}_advantages")
+            np.testing.assert_allclose(found[0], returns, rtol=1e-5)
+            np.testing.assert_allclose(found[1], returns - values, rtol=1e-4, atol=1e-5)
+        trainer.improve(rollout)
+    assert np.ptp(item.bonus) > 0
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant):
     """The batch that PPO gets, from the episodes by hand, with the episodes' own β."""
