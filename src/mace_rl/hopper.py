@@ -1,7 +1,7 @@
 """HopperBulletEnv-v0, the same to the bit, about three times as fast.
 
-The library asks the simulator some 35 questions a step, one at a time and through a wrapper that
-builds a `functools.partial` for each; here a step is six calls to `pybullet` itself. The rest is
+The library calls the simulator some 25 times a step, for one number or joint at a time, through a
+wrapper that builds a `functools.partial` each time; here a step is six calls. The rest is
 arithmetic on 15 numbers, for which plain floats are quicker than arrays: a Python float is the
 double that numpy uses, and +, -, *, / give the same bits as long as their order is the library's.
 Where numpy or BLAS chooses the instructions (sin, cos, arctan2, dot), either the result is exact
