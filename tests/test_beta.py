@@ -96,8 +96,8 @@ def test_sequence_is_state_action_reward_bonus(make):
         [
             *((episode.observations[t] - mean) / std),
             *(float(episode.actions[t] == action) for action in (0, 1)),
-            episode.rewards[t],
-            bonus[t],
+            math.copysign(math.log(1 + abs(episode.rewards[t])), episode.rewards[t]),
+            math.log(1 + bonus[t]),
         ]
         for t in range(6)
     ]
@@ -107,11 +107,12 @@ def test_sequence_is_state_action_reward_bonus(make):
 
 
 @pytest.mark.parametrize("length", [5, 6, 7, 13, 60])
-def test_long_sequences_are_averaged_over_stretches(make, length):
-    """At most 6 elements, each the mean of consecutive steps, as even as can be, none left out."""
+def test_long_sequences_are_condensed(make, length):
+    """At most 6 stretches of consecutive steps, as even as can be, none left out: mean state and
+    action, logarithm of the summed reward and bonus."""
     rng = np.random.default_rng(0)
     episode = episode_of(rng, Environment("Pendulum-v1", 0), length)
-    bonus = np.zeros(length)
+    bonus = rng.random(length)
     whole = make("Pendulum-v1", max_sequence=None).sequence(episode, bonus).numpy()
     found = make("Pendulum-v1", max_sequence=6).sequence(episode, bonus).numpy()
     if length <= 6:
@@ -120,7 +121,10 @@ def test_long_sequences_are_averaged_over_stretches(make, length):
     assert len(found) == 6
     bounds = [math.floor(i * length / 6) for i in range(7)]
     for row, (start, end) in zip(found, pairwise(bounds), strict=True):
-        np.testing.assert_allclose(row, whole[start:end].mean(0), rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(row[:-2], whole[start:end, :-2].mean(0), rtol=1e-4, atol=1e-6)
+        reward, summed = episode.rewards[start:end].sum(), bonus[start:end].sum()
+        assert row[-2] == pytest.approx(math.copysign(math.log(1 + abs(reward)), reward), rel=1e-5)
+        assert row[-1] == pytest.approx(math.log(1 + summed), rel=1e-5)
 
 
 def test_beta_of_the_next_episode_is_the_lstm_s_answer_to_the_last(make):
@@ -312,7 +316,7 @@ def test_without_credit_the_network_stays_as_it_is(make):
     controller.learn(np.ones(3), [np.ones(3)])  # credits the first β
     after = controller.network.parameters()
     assert all((a == b).all() for a, b in zip(before, after, strict=True))
-    assert not controller.optimiser.state
+    assert all(learner.time == 0 for learner in controller.learners)
 
 
 # --- Which β is credited with what --------------------------------------------------------------

@@ -88,6 +88,12 @@ def test_relevance_is_within_0_and_1_even_if_all_returns_are_equal():
                 assert 0 <= float(relevance(recollection(similarity, value), returns)) <= 1
 
 
+def test_relevance_is_in_the_middle_if_all_returns_are_equal_up_to_rounding():
+    returns = torch.full((1000,), 100.0)
+    for value in (100.0, np.nextafter(np.float32(100), np.float32(200))):
+        assert float(relevance(recollection(1.0, value), returns)) == pytest.approx(0.5, abs=0.1)
+
+
 # --- The bonus ----------------------------------------------------------------------------------
 
 
@@ -157,6 +163,15 @@ def test_familiar_and_unproductive_states_earn_least(make):
         curiosity.bonus(wander(50, centre=centre)).mean() for centre in (-1.0, 1.0, 8.0)
     )
     assert poor < 0.5 * rich < rich < 0.6 < 0.95 < unseen
+
+
+@pytest.mark.parametrize("name", ["FrozenLake-v1", "Taxi-v4"])
+def test_different_discrete_states_are_not_similar(make, name):
+    curiosity = make(name)
+    states = np.eye(curiosity.embedding.mean.size)
+    curiosity.remember(episode_of(states[[0, 0, 0]]), np.array([-50.0, 50.0]))
+    new = curiosity.bonus(episode_of(states[[0, 1]]))[0]
+    assert new > 0.95  # neither visited nor like what was
 
 
 def test_remembering_stores_one_step_in_write_every(make):

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from mace_rl.environments import Environment
-from mace_rl.ppo import PPO, Batch, Learner, advantages
+from mace_rl.learner import Learner
+from mace_rl.ppo import PPO, Batch, advantages
 from mace_rl.streams import numpy_generator
 
 ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1"]  # Discrete and Box actions
@@ -225,7 +226,7 @@ def test_learner_equals_torch_adam_with_clipping(make_ppo, max_gradient_norm):
     network = make_ppo().actor
     expected = torch.nn.Parameter(torch.from_numpy(network.parameters.astype(np.float64)))
     optimiser = torch.optim.Adam([expected], lr=0.01, eps=1e-5)
-    learner = Learner(network, 0.01, max_gradient_norm)
+    learner = Learner(network.parameters, 0.01, max_gradient_norm)
     rng = np.random.default_rng(0)
     for _ in range(30):
         gradient = 0.01 * rng.standard_normal(len(network.parameters))

@@ -152,12 +152,28 @@ def test_compiled_steps_equal_gymnasium_s_anywhere_in_the_state_space():
 # --- Which rollout ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", CLASSIC)
-def test_compiled_rollout_is_for_the_gymnasium_it_was_compared_with(name, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "attribute", "value"),
+    [
+        ("CartPole-v1", "gravity", 9.8000001),
+        ("CartPole-v1", "force_mag", 11.0),
+        ("CartPole-v1", "tau", 0.01),
+        ("CartPole-v1", "kinematics_integrator", "semi-implicit euler"),
+        ("CartPole-v1", "x_threshold", 2.0),
+        ("CartPole-v1", "_sutton_barto_reward", True),
+        ("Acrobot-v1", "book_or_nips", "nips"),
+        ("Acrobot-v1", "torque_noise_max", 0.1),
+        ("Acrobot-v1", "dt", 0.1),
+        ("Acrobot-v1", "AVAIL_TORQUE", [-1.0, 0.0, 2.0]),
+    ],
+)
+def test_changed_physics_take_the_ordinary_rollout(name, attribute, value):
     environment = Environment(name, 0)
+    before = environment.generator.bit_generator.state
     assert rollout_for(environment) is roll_out_compiled
-    monkeypatch.setattr(gymnasium, "__version__", "1.4.1")
+    setattr(environment.env.unwrapped, attribute, value)
     assert rollout_for(environment) is roll_out
+    assert environment.generator.bit_generator.state == before
 
 
 class HeavyCartPole(CartPoleEnv):
@@ -284,6 +300,28 @@ def test_noise_is_drawn_up_to_the_time_limit():
     assert (drawn == np.random.default_rng(0).random(500)).all()
     normals = draw_noise(Environment("Pendulum-v1", 0), np.random.default_rng(0))
     assert (normals == np.random.default_rng(0).standard_normal((200, 1))).all()
+
+
+class Reuser(Recorder):
+    """Returns the same array every time, changed in place."""
+
+    action_space = Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super(Recorder, self).reset(seed=seed)
+        self.state = np.zeros(4, np.float32)
+        return self.state, {}
+
+    def step(self, action):
+        self.state += 1
+        return self.state, 0.0, False, False, {}
+
+
+def test_observations_are_copied(register):
+    environment = Environment(register("Reuser-v0", Reuser, 3), 0)
+    noise = draw_noise(environment, np.random.default_rng(0))
+    observations = roll_out(environment, uniform_policy(environment), noise).observations
+    assert observations[:, 0].tolist() == [0, 1, 2, 3]
 
 
 # --- Environments -------------------------------------------------------------------------------

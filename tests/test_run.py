@@ -288,7 +288,7 @@ def test_damaged_checkpoint_is_not_continued(interrupted, tmp_path, caplog, dama
         ({"episodes": 5}, "config.episodes was 6 and is 5"),
         ({"ppo": {"clip": 0.3}}, "config.ppo.clip was 0.2 and is 0.3"),
         ({"beta": {"kind": "none"}}, "config.beta.kind was 'meta' and is 'none'"),
-        ({"meta": {"max_sequence": None}}, "config.meta.max_sequence was 64 and is None"),
+        ({"meta": {"max_sequence": None}}, "config.meta.max_sequence was 32 and is None"),
     ],
 )
 def test_checkpoint_of_another_configuration_is_not_continued(

@@ -380,7 +380,31 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, network):
         return update(batch)
 
     trainer.ppo.update = overflowing
-    with pytest.raises(NonFiniteError, match=f"seed 0, episode .*{network}.* is nan"):
+    with pytest.raises(
+        NonFiniteError, match=f"seed 0, the update after episode 3: .*{network}.* is nan"
+    ):
+        for _ in trainer.run():
+            pass
+
+
+def test_bad_first_observation_stops_the_run(run_config, register):
+    class Lost(Faulty):
+        def reset(self, *, seed=None, options=None):
+            state, info = super().reset(seed=seed)
+            return state + (np.nan if self.resets == 3 else 0), info
+
+    name = register("Lost-v0", Lost, 5, where="nowhere", value=0.0)
+    trainer = Trainer(run_config(name, "mace_full", 0, episodes=9))
+    with pytest.raises(NonFiniteError, match="episode 2: the observation is nan after the reset"):
+        for _ in trainer.run():
+            pass
+
+
+def test_bad_density_stops_the_run(run_config):
+    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9))
+    with torch.no_grad():
+        trainer.curiosity.novelty.density.biases[-1][:] = np.nan
+    with pytest.raises(NonFiniteError, match="seed 0, episode 1: a log-density is nan"):
         for _ in trainer.run():
             pass
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import ExponentialBeta, MetaConfig, RunConfig
+from mace_rl.learner import Learner
 from mace_rl.rollout import Episode
 from mace_rl.standardise import RunningStandardiser
 from mace_rl.streams import torch_generator
@@ -119,9 +120,10 @@ class MetaAdaptation:
             config.beta.initial,
             torch_generator(config.seed, "meta"),
         )
-        self.optimiser = torch.optim.Adam(
-            self.network.parameters(), self.config.learning_rate, fused=True
-        )
+        self.learners = [
+            Learner(parameter.detach().view(-1).numpy(), self.config.learning_rate)
+            for parameter in self.network.parameters()
+        ]
         self.standardiser = RunningStandardiser(environment.observation_size)
         self.beta: float = config.beta.initial
         # What gave rise to the β of each episode since the last `learn`, and to that of the next;
@@ -141,24 +143,23 @@ class MetaAdaptation:
     def sequence(self, episode: Episode, bonus: np.ndarray) -> Tensor:
         """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
 
-        float32 [min(T, max_sequence), input]; longer episodes are averaged over equal stretches.
+        float32 [min(T, max_sequence), input]. Longer episodes are cut into equal stretches: mean
+        state and action, and the sums of reward and bonus, as sign(x) log(1 + |x|), so that the
+        return can be read off and rewards of any size fit.
         """
         actions = episode.actions
         if self.action_count:
             actions = np.eye(self.action_count, dtype=np.float32)[actions]
-        columns = [
-            self.standardiser(episode.observations[:-1]),
-            actions,
-            episode.rewards[:, None],
-            bonus[:, None],
-        ]
-        sequence = np.concatenate(columns, axis=1)
+        seen = np.concatenate([self.standardiser(episode.observations[:-1]), actions], axis=1)
+        rewards = np.stack([episode.rewards, bonus], axis=1)
         length = self.config.max_sequence
-        if length is not None and len(sequence) > length:
-            starts = np.linspace(0, len(sequence), length, endpoint=False).astype(np.int64)
-            counts = np.diff(starts, append=len(sequence))
-            sequence = np.add.reduceat(sequence, starts) / counts[:, None]
-        return torch.from_numpy(sequence.astype(np.float32))
+        if length is not None and len(episode) > length:
+            starts = np.linspace(0, len(episode), length, endpoint=False).astype(np.int64)
+            counts = np.diff(starts, append=len(episode))
+            seen = np.add.reduceat(seen, starts) / counts[:, None]
+            rewards = np.add.reduceat(rewards, starts)
+        rewards = np.sign(rewards) * np.log1p(np.abs(rewards))
+        return torch.from_numpy(np.concatenate([seen, rewards], axis=1).astype(np.float32))
 
     def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """See `BetaController`: credit the βs of the last rollout, then remember this one's."""
@@ -169,17 +170,17 @@ class MetaAdaptation:
         ]
         if credited:
             loss = -sum(self.network(sequence) * credit for sequence, credit in credited)
-            self.optimiser.zero_grad()
+            self.network.zero_grad()
             (loss / len(credited)).backward()
             nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_gradient_norm)
-            self.optimiser.step()
+            for learner, parameter in zip(self.learners, self.network.parameters(), strict=True):
+                learner.descend(parameter.grad.view(-1).numpy())
         self.pending = [(self.sources.popleft(), gradient) for gradient in intrinsic]
 
     def state_dict(self) -> dict[str, Any]:
         """See `BetaController`."""
         return {
-            "network": self.network.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+            "learners": [learner.state_dict() for learner in self.learners],
             "standardiser": self.standardiser.state_dict(),
             "beta": self.beta,
             "sources": list(self.sources),
@@ -190,8 +191,8 @@ class MetaAdaptation:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `BetaController`."""
-        self.network.load_state_dict(state["network"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        for learner, saved in zip(self.learners, state["learners"], strict=True):
+            learner.load_state_dict(saved)
         self.standardiser.load_state_dict(state["standardiser"])
         self.beta = state["beta"]
         self.sources = deque(state["sources"])

@@ -1,12 +1,12 @@
 """The command `mace-rl`: one training run by hand, and repeating runs that were kept."""
 
 import argparse
-import json
 import logging
 import sys
 from pathlib import Path
 
 from mace_rl.hyperparameters import ConfigError, RunConfig
+from mace_rl.provenance import read_record
 from mace_rl.study import read_study
 
 logger = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ def finished(config: RunConfig, directory: Path) -> bool:
     record = directory / "run.json"
     if not record.exists():
         return False
-    found = json.loads(record.read_text(encoding="utf-8"))["config"]
+    found = read_record(record)["config"]
     wanted = config.model_dump()
     different = [key for key in wanted if found.get(key) != wanted[key]]
     if different:
@@ -76,6 +76,7 @@ def train(arguments: argparse.Namespace) -> None:
     """`mace-rl train`."""
     config = run_config(arguments)
     if finished(config, arguments.out):
+        (arguments.out / "checkpoint.pt").unlink(missing_ok=True)  # killed between the two
         logger.info("%s holds this run already, finished", arguments.out)
         return
     # Imported here: PyTorch takes seconds, and a mistake in the command should not.

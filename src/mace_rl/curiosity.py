@@ -22,7 +22,8 @@ def relevance(recollection: Recollection, returns: Tensor) -> Tensor:
     anything remembered has relevance 1, one like unproductive states goes toward 0, and one like
     productive states stays near 1.
     """
-    spread = returns.std(correction=0).clamp(min=1e-8)
+    # Not below float32's rounding, which would decide if all returns were equal.
+    spread = returns.std(correction=0) + 1e-6 * returns.abs().mean() + 1e-8
     productivity = torch.sigmoid((recollection.values[:, -1] - returns.mean()) / spread)
     return 1 - recollection.similarity * (1 - productivity)
 
@@ -56,14 +57,23 @@ class Curiosity:
             recollection = self.memory.lookup(
                 torch.from_numpy(states),
                 torch.from_numpy(self.embedding.mean.astype(np.float32)),
-                torch.from_numpy(self.embedding.std.astype(np.float32)),
+                torch.from_numpy(self.scale().astype(np.float32)),
             )
             return novelty * relevance(recollection, self.memory.returns).double().numpy()
+
+    def scale(self) -> np.ndarray:
+        """The unit of distance between states, [observation].
+
+        One-hot states differ in two dimensions however many there are: in this unit by 2 per
+        dimension, like independent standardised ones.
+        """
+        size = len(self.embedding.mean)
+        return np.full(size, size**-0.5) if self.discrete else self.embedding.std
 
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
         """Make the episode part of memory and of what is no longer novel.
 
-        returns: extrinsic return-to-go of each step, [T].
+        returns: extrinsic return-to-go of each step, [T], as its λ-return.
         """
         chosen = slice(None, None, self.config.memory.write_every)
         self.memory.write(

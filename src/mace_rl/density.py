@@ -2,43 +2,52 @@
 
 import math
 
-import torch
-from torch import Tensor, nn
+import numpy as np
+
+from mace_rl.network import MLP
+
+SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
 
 
-class MADE(nn.Module):
+class MADE(MLP):
     """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)) with one masked hidden layer.
 
-    Being autoregressive it is normalised: p integrates to 1 whatever the weights are.
+    Being autoregressive it is normalised: p integrates to 1 whatever the weights are. Masked
+    weights start at 0 and their gradient is 0, so they stay there.
     """
 
-    def __init__(self, size: int, hidden_units: int, generator: torch.Generator) -> None:
-        super().__init__()
-        # Unit h sees inputs below its degree; output i sees units whose degree is at most i.
-        degrees = torch.arange(hidden_units) % max(size - 1, 1) + 1
-        inputs = torch.arange(1, size + 1)
-        self.register_buffer("input_mask", (degrees[:, None] >= inputs).float())  # [hidden, size]
-        self.register_buffer(
-            "output_mask", (inputs[:, None] > degrees).float().repeat(2, 1)
-        )  # [2 size, hidden]
-        bound = 1 / math.sqrt(hidden_units)
-        self.input_weight = nn.Parameter(torch.empty(hidden_units, size))
-        self.input_bias = nn.Parameter(torch.zeros(hidden_units))
-        self.output_weight = nn.Parameter(torch.empty(2 * size, hidden_units))
-        self.output_bias = nn.Parameter(torch.zeros(2 * size))
-        nn.init.uniform_(self.input_weight, -1, 1, generator=generator)
-        nn.init.uniform_(self.output_weight, -bound, bound, generator=generator)
+    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
+        super().__init__([size, hidden_units, 2 * size], output_gain=0.1, generator=generator)
+        # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
+        degrees = np.arange(hidden_units) % max(size - 1, 1) + 1
+        coordinates = np.arange(1, size + 1)
+        self.mask = np.ones_like(self.parameters)
+        (inward, outward), _ = self.split(self.mask)
+        inward[:] = coordinates[:, None] <= degrees
+        outward[:] = np.tile(degrees[:, None] < coordinates, 2)
+        self.parameters *= self.mask
 
-    def log_prob(self, x: Tensor) -> Tensor:
+    def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, [N, size] → [N]."""
-        hidden = torch.tanh(
-            nn.functional.linear(x, self.input_weight * self.input_mask, self.input_bias)
-        )
-        outputs = nn.functional.linear(
-            hidden, self.output_weight * self.output_mask, self.output_bias
-        )
-        mean, log_std = outputs.chunk(2, dim=1)
-        # Bounded away from 0: a coordinate that never varies would otherwise have infinite density.
-        log_std = log_std.clamp(min=-5.0)
-        deviations = (x - mean) * torch.exp(-log_std)
-        return (-0.5 * deviations.square() - log_std - 0.5 * math.log(2 * math.pi)).sum(1)
+        deviations, log_std = self._standardised(x, self.forward(x)[-1])
+        constant = np.float32(0.5 * math.log(2 * math.pi))
+        return (-0.5 * deviations * deviations - log_std - constant).sum(axis=1)
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """∇ of the mean log-density of the rows of x, [N, size], with respect to `parameters`."""
+        activations = self.forward(x)
+        outputs = activations[-1]
+        deviations, log_std = self._standardised(x, outputs)
+        slope = np.empty_like(outputs)
+        mean_slope, log_std_slope = np.split(slope, 2, axis=1)
+        mean_slope[:] = deviations * np.exp(-log_std)
+        log_std_slope[:] = deviations * deviations - 1
+        log_std_slope *= outputs[:, x.shape[1] :] > SMALLEST_LOG_STD
+        slope /= len(x)
+        return self.backward(activations, slope) * self.mask
+
+    def _standardised(self, x: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(x - μ) / σ and log σ, [N, size] each, from the network's outputs, [N, 2 size]."""
+        mean, log_std = np.split(outputs, 2, axis=1)
+        log_std = np.maximum(log_std, np.float32(SMALLEST_LOG_STD))
+        return (x - mean) * np.exp(-log_std), log_std

@@ -63,7 +63,7 @@ class Environment:
             vector = np.zeros(self.observation_size, np.float32)
             vector[int(observation) - int(self.observation_space.start)] = 1.0
             return vector
-        return np.asarray(observation, np.float32).ravel()
+        return np.array(observation, np.float32).ravel()  # a copy: some reuse theirs
 
     @property
     def generator(self) -> np.random.Generator:

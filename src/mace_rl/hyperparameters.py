@@ -91,7 +91,7 @@ class MetaConfig(Section):
     hidden_units: PositiveInt
     learning_rate: PositiveFloat = Field(lt=1)
     max_gradient_norm: PositiveFloat
-    max_sequence: PositiveInt | None  # longer episodes are averaged down to this many elements
+    max_sequence: PositiveInt | None  # longer episodes are condensed to this many elements
 
 
 class NoBonus(Section):

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 
 from mace_rl.density import MADE
+from mace_rl.finite import require_finite
 from mace_rl.hyperparameters import NoveltyConfig
+from mace_rl.learner import Learner
 from mace_rl.nearest import nearest
 from mace_rl.standardise import RunningStandardiser
-from mace_rl.streams import numpy_generator, torch_generator
+from mace_rl.streams import numpy_generator
 
 
 class Novelty(Protocol):
@@ -85,13 +87,11 @@ class DensityNovelty:
         self.buffer = np.zeros((config.buffer_size, observation_size), np.float32)
         self.seen = 0  # states ever written; the buffer is a ring
         self.density = MADE(
-            observation_size, config.density_hidden_units, torch_generator(seed, "density")
+            observation_size, config.density_hidden_units, numpy_generator(seed, "density")
         )
-        self.optimiser = torch.optim.Adam(
-            self.density.parameters(), config.density_learning_rate, fused=True
-        )
+        self.learner = Learner(self.density.parameters, config.density_learning_rate)
         self.batches = numpy_generator(seed, "density_batches")
-        self.reference = torch.zeros(0)  # sorted log-densities of visited states
+        self.reference = np.zeros(0, np.float32)  # sorted log-densities of visited states
 
     @property
     def visited(self) -> np.ndarray:
@@ -117,12 +117,10 @@ class DensityNovelty:
         ]
         return np.mean(ensemble, axis=0)
 
-    @torch.no_grad()
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
-        log_probs = self.density.log_prob(torch.from_numpy(self.embedding(states)))
-        lower = torch.searchsorted(self.reference, log_probs)
-        return 1 - lower.double().numpy() / len(self.reference)
+        log_probs = self.density.log_prob(self.embedding(states))
+        return 1 - np.searchsorted(self.reference, log_probs) / len(self.reference)
 
     def observe(self, states: np.ndarray) -> None:
         """Add one in `write_every` of an episode's states and train the density estimator."""
@@ -133,28 +131,25 @@ class DensityNovelty:
         visited = self.visited
         for _ in range(self.config.density_steps):
             index = self.batches.integers(len(visited), size=self.config.density_batch_size)
-            log_probs = self.density.log_prob(torch.from_numpy(self.embedding(visited[index])))
-            self.optimiser.zero_grad()
-            (-log_probs.mean()).backward()
-            self.optimiser.step()
-        self.reference = log_probs.detach().sort().values
+            sample = self.embedding(visited[index])
+            self.learner.descend(-self.density.gradient(sample))
+        self.reference = np.sort(self.density.log_prob(sample))
+        require_finite("a log-density", self.reference)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Novelty`."""
         return {
             "buffer": torch.from_numpy(self.visited.copy()),
             "seen": self.seen,
-            "density": self.density.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+            "density": self.learner.state_dict(),
             "batches": self.batches.bit_generator.state,
-            "reference": self.reference,
+            "reference": torch.from_numpy(self.reference),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `Novelty`."""
         self.buffer[: len(state["buffer"])] = state["buffer"].numpy()
         self.seen = state["seen"]
-        self.density.load_state_dict(state["density"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.learner.load_state_dict(state["density"])
         self.batches.bit_generator.state = state["batches"]
-        self.reference = state["reference"].clone()
+        self.reference = state["reference"].numpy().copy()

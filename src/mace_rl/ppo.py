@@ -1,16 +1,15 @@
 """Proximal Policy Optimization (Schulman et al. 2017) with one critic per kind of reward."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numba import njit
 
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import PPOConfig
+from mace_rl.learner import Learner
 from mace_rl.network import MLP
 from mace_rl.policy import ActingPolicy, Actor
 from mace_rl.standardise import RunningStandardiser
@@ -47,57 +46,6 @@ class Batch:
     returns: dict[str, np.ndarray]  # for each critic the λ-returns it learns, float32 [N]
 
 
-@njit(cache=True)
-def adam(parameters, gradient, mean, square, time, learning_rate):
-    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; all arrays float32 [n].
-
-    mean and square are the moments' running estimates, time counts steps from 1.
-    """
-    decay_mean, decay_square, epsilon = 0.9, 0.999, 1e-5
-    rate = np.float32(learning_rate / (1 - decay_mean**time))
-    scale = np.float32(1 / math.sqrt(1 - decay_square**time))
-    keep_mean, keep_square = np.float32(decay_mean), np.float32(decay_square)
-    add_mean, add_square = np.float32(1 - decay_mean), np.float32(1 - decay_square)
-    for i in range(len(parameters)):
-        mean[i] = keep_mean * mean[i] + add_mean * gradient[i]
-        square[i] = keep_square * square[i] + add_square * gradient[i] * gradient[i]
-        parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(epsilon))
-
-
-class Learner:
-    """Adam on a network's parameters, with the gradient clipped by its norm."""
-
-    def __init__(self, network: MLP, learning_rate: float, max_gradient_norm: float) -> None:
-        self.parameters = network.parameters
-        self.learning_rate = learning_rate
-        self.max_gradient_norm = max_gradient_norm
-        self.mean, self.square = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
-        self.time = 0
-
-    def descend(self, gradient: np.ndarray) -> float:
-        """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
-        norm = float(np.sqrt(gradient @ gradient))
-        if norm > self.max_gradient_norm:
-            gradient = gradient * np.float32(self.max_gradient_norm / norm)
-        self.time += 1
-        adam(self.parameters, gradient, self.mean, self.square, self.time, self.learning_rate)
-        return norm
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters and the optimiser's moments."""
-        arrays = {"parameters": self.parameters, "mean": self.mean, "square": self.square}
-        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()} | {
-            "time": self.time
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, in place: the network holds the same arrays."""
-        self.parameters[:] = state["parameters"].numpy()
-        self.mean[:] = state["mean"].numpy()
-        self.square[:] = state["square"].numpy()
-        self.time = state["time"]
-
-
 class PPO:
     """Actor and critics with their optimisers, and the update.
 
@@ -123,11 +71,12 @@ class PPO:
             kind: MLP([size, *config.hidden_units, 1], 1.0, numpy_generator(seed, f"{kind}_critic"))
             for kind in kinds
         }
+        rates = {"actor": config.actor_learning_rate} | dict.fromkeys(
+            kinds, config.critic_learning_rate
+        )
         self.learners = {
-            "actor": Learner(self.actor, config.actor_learning_rate, config.max_gradient_norm)
-        } | {
-            kind: Learner(network, config.critic_learning_rate, config.max_gradient_norm)
-            for kind, network in self.critics.items()
+            name: Learner(network.parameters, rates[name], config.max_gradient_norm)
+            for name, network in ({"actor": self.actor} | self.critics).items()
         }
         self.standardiser = RunningStandardiser(size)
         self.minibatches = numpy_generator(seed, "minibatches")

@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.metadata
+import json
 import os
 import platform
 import subprocess
@@ -21,6 +22,10 @@ PACKAGES = (
     "pybullet",
     "pybullet-envs-gymnasium",
 )
+
+
+class ProvenanceError(ValueError):
+    """A `run.json` that cannot be trusted; the message names it."""
 
 
 def file_digest(path: Path) -> str:
@@ -63,3 +68,15 @@ def cpu_model() -> str:
 def machine() -> dict[str, Any]:
     """Processor, its number of cores, and the system."""
     return {"cpu": cpu_model(), "cores": os.cpu_count(), "system": platform.platform()}
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A `run.json`; `ProvenanceError` if it is not whole."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        missing = {"config", "versions", "sources", "machine", "outputs"} - set(record)
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
+        raise ProvenanceError(f"{path}: not readable: {error}") from None
+    if missing:
+        raise ProvenanceError(f"{path}: the key {min(missing)!r} is missing")
+    return record

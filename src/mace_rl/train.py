@@ -83,25 +83,31 @@ class Trainer:
         """
         while len(self.records) < self.config.episodes:
             start = len(self.records)
+            updating = False
             try:
                 rollout = self.collect()
+                updating = True
                 self.adapt(rollout)
                 self.improve(rollout)
             except NonFiniteError as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
-                raise NonFiniteError(f"{run}, episode {len(self.records) + 1}: {error}") from None
+                done = len(self.records)
+                where = f"the update after episode {done}" if updating else f"episode {done + 1}"
+                raise NonFiniteError(f"{run}, {where}: {error}") from None
             yield self.records[start:]
 
     def collect(self) -> list[Experience]:
         """Play episodes with the current policy until a rollout is full."""
         policy = self.ppo.acting_policy()
         rollout: list[Experience] = []
-        steps = 0
-        while steps < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes:
+        collected = 0
+        while (
+            collected < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes
+        ):
             noise = draw_noise(self.environment, self.noise)
             episode = self.rollout(self.environment, policy, noise)
             rollout.append(self.appraise(episode))
-            steps += len(episode)
+            collected += len(episode)
         return rollout
 
     def appraise(self, episode: Episode) -> Experience:
@@ -155,10 +161,8 @@ class Trainer:
                 *(normalised_change(total, change) for change in intrinsic_parts(rollout)),
             ],
         )
-        length = np.linalg.norm(update)
-        self.controller.learn(
-            extrinsic_gradient, [change / length if length > 0 else change for change in changes]
-        )
+        length = max(float(np.linalg.norm(update)), 1e-8)
+        self.controller.learn(extrinsic_gradient, [change / length for change in changes])
 
     def improve(self, rollout: list[Experience]) -> None:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""

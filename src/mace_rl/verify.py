@@ -5,17 +5,16 @@ differ, and training amplifies it; then the question is by how much, and whether
 agree.
 """
 
-import json
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mace_rl.checkpoint import difference
 from mace_rl.hyperparameters import RunConfig, check
-from mace_rl.provenance import file_digest
+from mace_rl.provenance import file_digest, read_record
 from mace_rl.records import RecordError, read_episodes
 from mace_rl.statistics import paired_comparison
 
@@ -71,18 +70,6 @@ def repeat(run_folder: Path) -> Repetition:
         spread=before["extrinsic_return"].std(),
         origin=difference(*origins),
     )
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """A `run.json`; `RecordError` if it is not whole."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        missing = {"config", "versions", "sources", "machine", "outputs"} - set(record)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
-        raise RecordError(f"{path}: not readable: {error}") from None
-    if missing:
-        raise RecordError(f"{path}: the key {min(missing)!r} is missing")
-    return record
 
 
 def describe(result: Repetition) -> str:

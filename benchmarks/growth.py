@@ -1,0 +1,88 @@
+"""Whether a long `mace_full` run slows down or grows: growth.csv, one row per episode.
+
+The environments are random walks of fixed length that cost next to nothing, so that every episode
+is the same work and nearly all of it our own.
+
+`python -m benchmarks.growth WALK EPISODES` is one run.
+"""
+
+import sys
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+
+from benchmarks.process import measured, memory_mb, one_thread, report, write_rows
+from benchmarks.settings import ACROBOT, FIRST_SEED, HOPPER, Scale
+
+# Shaped like Acrobot and like Hopper, with their settings and time limits.
+WALKS = {"AcrobotLikeWalk-v0": ACROBOT, "HopperLikeWalk-v0": HOPPER}
+
+
+class Walk(gymnasium.Env):
+    """States wander around 0 whatever the action; the reward is the first coordinate."""
+
+    def __init__(self, size: int, action_space: gymnasium.Space) -> None:
+        self.observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        """Start at 0."""
+        super().reset(seed=seed)
+        self.state = np.zeros(self.observation_space.shape, np.float32)
+        return self.state, {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """An AR(1) process; never terminates."""
+        noise = self.np_random.standard_normal(self.state.shape, np.float32)
+        self.state = np.float32(0.95) * self.state + np.float32(0.3) * noise
+        return self.state, float(self.state[0]), False, False, {}
+
+
+def register() -> None:
+    """Make the walks known to Gymnasium."""
+    for name, size, action_space, limit in (
+        ("AcrobotLikeWalk-v0", 6, Discrete(3), 500),
+        ("HopperLikeWalk-v0", 15, Box(-1, 1, (3,), np.float32), 1000),
+    ):
+        arguments = {"size": size, "action_space": action_space}
+        gymnasium.register(name, entry_point=Walk, max_episode_steps=limit, kwargs=arguments)
+
+
+def measure_all(scale: Scale) -> None:
+    """Run `mace_full` on both walks and write growth.csv."""
+    rows = []
+    for walk in WALKS:
+        rows += [{"env": walk, **row} for row in measured("growth", walk, scale.growth_episodes)]
+        write_rows(scale.data / "growth.csv", rows)
+        print(f"growth: {walk}: {rows[-1]['cpu_seconds']:.0f} s, {rows[-1]['memory_mb']:.0f} MB")
+
+
+def main() -> None:
+    """One run."""
+    walk, episodes = sys.argv[1:]
+    from benchmarks.contestants import our_config
+    from mace_rl.train import Trainer
+
+    one_thread()
+    register()
+    config = our_config("mace_full", WALKS[walk], FIRST_SEED)
+    trainer = Trainer(config.model_copy(update={"environment": walk, "episodes": int(episodes)}))
+    rows = []
+    start = time.process_time()
+    for records in trainer.run():
+        rows.append(
+            {
+                "episode": records[-1].episode,
+                "env_steps": records[-1].env_steps,
+                "cpu_seconds": time.process_time() - start,
+                "memory_mb": memory_mb("VmRSS"),
+            }
+        )
+    report(rows)
+
+
+if __name__ == "__main__":
+    main()
