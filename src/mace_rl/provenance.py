@@ -66,8 +66,9 @@ def cpu_model() -> str:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, its number of cores, and the system."""
-    return {"cpu": cpu_model(), "cores": os.cpu_count(), "system": platform.platform()}
+    """Processor, its number of cores, system and C library."""
+    system = " ".join([platform.system(), *platform.libc_ver()])
+    return {"cpu": cpu_model(), "cores": os.cpu_count(), "system": system}
 
 
 def read_record(path: Path) -> dict[str, Any]:

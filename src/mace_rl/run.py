@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import resource
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,6 +70,7 @@ def run(config: RunConfig, directory: Path) -> None:
                             "trainer": trainer.state_dict(),
                             "seconds": clock.elapsed(),
                             "interruptions": interruptions,
+                            "machine": provenance.machine(),
                         },
                     )
         write_results(directory, trainer, identity, clock, interruptions)
@@ -87,21 +87,25 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
     }
 
 
-def resume(trainer: Trainer, path: Path, identity: dict[str, Any]) -> tuple[float, int]:
+def resume(
+    trainer: Trainer, path: Path, identity: dict[str, Any]
+) -> tuple[float, list[dict[str, Any]]]:
     """Continue from the checkpoint at `path`, if it is this run's.
 
-    Returns the seconds already spent and how often the run has been interrupted.
+    Returns the seconds already spent, and for each interruption so far the episode after which the
+    run was continued and the machine that had done the part before.
     """
     if not path.exists():
-        return 0.0, 0
+        return 0.0, []
     try:
         state = checkpoint.load(path, identity)
     except checkpoint.CheckpointError as error:
         logger.warning("starting afresh: %s", error)
-        return 0.0, 0
+        return 0.0, []
     trainer.load_state_dict(state["trainer"])
     logger.info("resuming after episode %d", len(trainer.records))
-    return state["seconds"], state["interruptions"] + 1
+    interruption = {"after_episode": len(trainer.records), "machine": state["machine"]}
+    return state["seconds"], [*state["interruptions"], interruption]
 
 
 class Clock:
@@ -181,7 +185,11 @@ def write_progress(directory: Path, trainer: Trainer, clock: Clock) -> None:
 
 
 def write_results(
-    directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock, interruptions: int
+    directory: Path,
+    trainer: Trainer,
+    identity: dict[str, Any],
+    clock: Clock,
+    interruptions: list[dict[str, Any]],
 ) -> None:
     """Write the records, the agent and, when those are safe, where they come from."""
     write_episodes(
@@ -198,7 +206,6 @@ def write_results(
         "code": provenance.git_state(),
         "machine": provenance.machine(),
         "threads": torch.get_num_threads(),
-        "command": sys.argv,
         "seconds": clock.elapsed(),
         "checkpoint_seconds": clock.checkpoint_seconds,
         "interruptions": interruptions,
