@@ -1,6 +1,10 @@
 """Making environments: Gymnasium's registry, observations as vectors, generators that resume."""
 
 import copy
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -13,6 +17,23 @@ from mace_rl.streams import sequence
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.hopper:FastHopperBulletEnv"}
+
+
+@contextmanager
+def nothing_printed() -> Iterator[None]:
+    """Keep off the terminal what pybullet prints, from C, when it is loaded and connected."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        for descriptor, _ in kept:
+            os.dup2(nowhere.fileno(), descriptor)
+    try:
+        yield
+    finally:
+        for descriptor, copy_ in kept:
+            os.dup2(copy_, descriptor)
+            os.close(copy_)
 
 
 class Environment:
@@ -29,7 +50,8 @@ class Environment:
             raise ConfigError(f"environment {name!r}: {error}") from None
         spec.entry_point = FASTER.get(name, spec.entry_point)
         self.name = name
-        self.env = gymnasium.make(spec, disable_env_checker=True)
+        with nothing_printed():
+            self.env = gymnasium.make(spec, disable_env_checker=True)
         if spec.max_episode_steps is None:
             raise ConfigError(
                 f"environment {name!r} has no time limit (max_episode_steps), so its episodes "
@@ -55,7 +77,8 @@ class Environment:
         # The Bullet environments save their state at the first, randomised reset and restore it at
         # every later one, which makes the first episode unlike all others. A throw-away reset lets
         # a fresh environment with the same generator state replay an aged one to the bit.
-        self.env.reset(seed=int(sequence(seed, "environment").generate_state(1)[0]))
+        with nothing_printed():
+            self.env.reset(seed=int(sequence(seed, "environment").generate_state(1)[0]))
 
     def encode(self, observation: Any) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]."""
