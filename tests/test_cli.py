@@ -56,6 +56,7 @@ MALFORMED = {
     "episodes that are text": ["train", *sum(GOOD.items(), ()), "--out", "x", "--episodes", "1e3"],
     "option without value": ["train", "--env"],
     "verify without folder": ["verify"],
+    "evaluate without folder": ["evaluate", "--episodes", "3"],
 }
 
 
@@ -135,6 +136,50 @@ def reference(monkeypatch, tmp_path):
     options = sum((GOOD | {"--out": str(folder)}).items(), ())
     assert call(monkeypatch, "train", *options) == (0, "")
     return tmp_path
+
+
+def test_an_agent_plays_as_at_the_end_of_its_training(monkeypatch, tmp_path, capsys):
+    """Its returns are those of a trainer that trained it here and plays on."""
+    import gymnasium
+    import numpy as np
+    import torch
+
+    from mace_rl.evaluate import evaluate, load_agent
+
+    options = GOOD | {"--env": "HopperBulletEnv-v0", "--episodes": "6", "--out": str(tmp_path)}
+    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    assert call(monkeypatch, "evaluate", str(tmp_path), "--episodes", "3") == (0, "")
+    assert capsys.readouterr().out.startswith("3 episodes: mean return ")
+    agent = load_agent(tmp_path)
+    actor, mean = agent.ppo.actor, agent.ppo.standardiser.mean
+    env = gymnasium.make("HopperBulletEnv-v0")
+    generator = np.random.default_rng(5)
+    for _ in range(2):  # the library's own environment; its first reset is thrown away
+        observation, _ = env.reset(seed=5)
+    observation, _ = env.reset()
+    noise = generator.standard_normal((1000, 3))
+    layers = [
+        (torch.from_numpy(weights.copy()), torch.from_numpy(biases.copy()))
+        for weights, biases in zip(actor.weights, actor.biases, strict=True)
+    ]
+    total = 0.0
+    for step in range(1000):
+        x = np.clip((observation - mean) / agent.ppo.standardiser.std, -10, 10)
+        hidden = torch.from_numpy(x.astype(np.float32))
+        for weights, biases in layers[:-1]:
+            hidden = torch.tanh(hidden @ weights + biases)
+        action = (hidden @ layers[-1][0] + layers[-1][1]).numpy()
+        action = action + np.exp(actor.log_std) * noise[step]
+        observation, reward, terminated, truncated, _ = env.step(
+            np.clip(action, -1, 1).astype(np.float32)
+        )
+        total += reward
+        if terminated or truncated:
+            break
+    assert evaluate(tmp_path, 1, 5)[0] == pytest.approx(total, rel=1e-3)
+    (tmp_path / "agent.pt").write_bytes((tmp_path / "agent.pt").read_bytes()[:-7])
+    code, message = call(monkeypatch, "evaluate", str(tmp_path))
+    assert code == 1 and "agent.pt" in message and "cut off" in message
 
 
 def test_a_kept_run_is_verified_to_the_bit(reference, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""The command `mace-rl`: one training run by hand, and repeating runs that were kept."""
+"""The command `mace-rl`: train one run, play with its agent, repeat runs that were kept."""
 
 import argparse
 import logging
@@ -32,6 +32,15 @@ def parser() -> argparse.ArgumentParser:
         "--config", type=Path, help="a YAML file read over the project's config.yaml"
     )
     train.add_argument("--out", required=True, type=Path, help="folder for the results")
+    evaluate = commands.add_parser(
+        "evaluate",
+        allow_abbrev=False,
+        help="play episodes with a trained agent",
+        description="Play episodes with a trained agent and print its returns.",
+    )
+    evaluate.add_argument("folder", type=Path, help="of a finished run")
+    evaluate.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
+    evaluate.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     verify = commands.add_parser(
         "verify",
         allow_abbrev=False,
@@ -86,6 +95,19 @@ def train(arguments: argparse.Namespace) -> None:
     logger.info("finished: %s", arguments.out / "episodes.csv")
 
 
+def evaluate(arguments: argparse.Namespace) -> None:
+    """`mace-rl evaluate`."""
+    from mace_rl import evaluate
+
+    if arguments.episodes < 1 or arguments.seed < 0:
+        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+    returns = evaluate.evaluate(arguments.folder, arguments.episodes, arguments.seed)
+    print(
+        f"{len(returns)} episodes: mean return {returns.mean():.2f}, standard deviation "
+        f"{returns.std():.2f}, from {returns.min():.2f} to {returns.max():.2f}"
+    )
+
+
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
     from mace_rl import verify
@@ -104,7 +126,7 @@ def main() -> None:
     arguments = parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
-        {"train": train, "verify": verify}[arguments.command](arguments)
+        {"train": train, "evaluate": evaluate, "verify": verify}[arguments.command](arguments)
     except (ValueError, RuntimeError, ArithmeticError, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
