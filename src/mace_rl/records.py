@@ -6,6 +6,7 @@ the line, because a damaged record would otherwise become a plausible number in 
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,15 +17,21 @@ from mace_rl.files import write_atomically
 if TYPE_CHECKING:  # pandas is imported where a frame is built: training only writes
     import pandas as pd
 
-EPISODE_COLUMNS: Mapping[str, type] = {
-    "episode": int,  # 1, 2, …
-    "env_steps": int,  # environment steps since the start of training, this episode included
-    "length": int,  # environment steps of this episode
-    "extrinsic_return": float,  # undiscounted sum of the environment's rewards
-    "intrinsic_return": float,  # undiscounted sum of the curiosity bonus, not weighted by β
-    "beta": float,  # β of this episode
-    "terminated": int,  # 1: the environment ended the episode, 0: its time limit did
-}
+
+@dataclass(frozen=True)
+class Record:
+    """One episode of training, a row of `episodes.csv`."""
+
+    episode: int  # 1, 2, …
+    env_steps: int  # environment steps since the start of training, this episode included
+    length: int  # environment steps of this episode
+    extrinsic_return: float  # undiscounted sum of the environment's rewards
+    intrinsic_return: float  # undiscounted sum of the curiosity bonus, not weighted by β
+    beta: float  # β of this episode
+    terminated: int  # 1: the environment ended the episode, 0: its time limit did
+
+
+EPISODE_COLUMNS: Mapping[str, type] = {field.name: field.type for field in fields(Record)}
 
 Run = tuple[str, str, int]  # environment, variant, seed
 

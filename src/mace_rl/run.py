@@ -13,7 +13,6 @@ import resource
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,8 @@ from threadpoolctl import threadpool_limits
 from mace_rl import checkpoint, provenance, sources
 from mace_rl.files import write_atomically
 from mace_rl.hyperparameters import RunConfig
-from mace_rl.records import write_episodes
-from mace_rl.train import Record, Trainer
+from mace_rl.records import EPISODE_COLUMNS, write_episodes
+from mace_rl.train import Trainer
 
 logger = logging.getLogger(__name__)
 
@@ -195,8 +194,8 @@ def write_results(
     write_episodes(
         directory / "episodes.csv",
         {
-            field.name: np.array([getattr(record, field.name) for record in trainer.records])
-            for field in fields(Record)
+            name: np.array([getattr(record, name) for record in trainer.records])
+            for name in EPISODE_COLUMNS
         },
     )
     agent = checkpoint.archive(trainer.agent())

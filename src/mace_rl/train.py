@@ -9,7 +9,7 @@ that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta`, `ppo
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,21 +21,9 @@ from mace_rl.environments import Environment
 from mace_rl.finite import NonFiniteError, require_finite
 from mace_rl.hyperparameters import ExponentialBeta, MetaBeta, NoBonus, RunConfig
 from mace_rl.ppo import PPO, Batch
+from mace_rl.records import EPISODE_COLUMNS, Record
 from mace_rl.rollout import Episode, draw_noise, rollout_for
 from mace_rl.streams import numpy_generator
-
-
-@dataclass(frozen=True)
-class Record:
-    """One row of episodes.csv."""
-
-    episode: int  # from 1
-    env_steps: int  # since the start of training, this episode included
-    length: int
-    extrinsic_return: float  # undiscounted
-    intrinsic_return: float  # sum of the bonus, not weighted by β
-    beta: float
-    terminated: int  # 0: cut off by the time limit
 
 
 @dataclass(frozen=True)
@@ -101,9 +89,8 @@ class Trainer:
         policy = self.ppo.acting_policy()
         rollout: list[Experience] = []
         collected = 0
-        while (
-            collected < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes
-        ):
+        wanted = self.config.ppo.rollout_steps
+        while collected < wanted and len(self.records) < self.config.episodes:
             noise = draw_noise(self.environment, self.noise)
             episode = self.rollout(self.environment, policy, noise)
             rollout.append(self.appraise(episode))
@@ -206,11 +193,11 @@ class Trainer:
             "noise": self.noise.bit_generator.state,
             "environment": self.environment.generator.bit_generator.state,
             "records": {
-                field.name: torch.tensor(
-                    [getattr(record, field.name) for record in self.records],
-                    dtype=torch.float64 if field.type is float else torch.int64,
+                name: torch.tensor(
+                    [getattr(record, name) for record in self.records],
+                    dtype=torch.float64 if kind is float else torch.int64,
                 )
-                for field in fields(Record)
+                for name, kind in EPISODE_COLUMNS.items()
             },
         }
 
