@@ -4,8 +4,8 @@
     .venv/bin/python -m benchmarks.same_learning /tmp/old 60
 
 Prints, for each environment and both checkouts, the mean over seeds of the final return and of the
-episode at which the 50-episode average first covers three quarters of the way from the random return
-to -100 (Acrobot) or 475 (CartPole), and the p value of a Mann-Whitney test.
+episode at which the 50-episode average first covers three quarters of the way from the random
+return to -100 (Acrobot) or 475 (CartPole), and the p value of a Mann-Whitney test.
 """
 
 import json
