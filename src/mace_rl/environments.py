@@ -74,9 +74,9 @@ class Environment:
         self.observation_size = (
             int(observations.n) if self.discrete_observations else int(np.prod(observations.shape))
         )
-        # The Bullet environments save their state at the first, randomised reset and restore it at
-        # every later one, which makes the first episode unlike all others. A throw-away reset lets
-        # a fresh environment with the same generator state replay an aged one to the bit.
+        # A Bullet environment's first reset averages the robot's position over one part fewer than
+        # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
+        # environment with the same generator state replay an aged one to the bit.
         with nothing_printed():
             self.env.reset(seed=int(sequence(seed, "environment").generate_state(1)[0]))
 

@@ -1,7 +1,7 @@
 """Exact nearest neighbours among a few thousand points, by brute force in compiled code.
 
 Trees lose in this setting: the points change every episode, so a tree serves a few hundred
-queries, and in Hopper's 15 dimensions it prunes next to nothing (`make bench`).
+queries, and in Hopper's 15 dimensions it prunes next to nothing.
 """
 
 import numpy as np

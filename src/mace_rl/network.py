@@ -1,8 +1,8 @@
 """A multilayer perceptron with its gradient written out, on NumPy.
 
 Two hidden layers of 64 units are too small for a tensor library: most of a PyTorch update of this
-size is call overhead and a slow tanh. Written out it is several times faster (`make bench`), and
-the flat parameters need no copying between learning and acting.
+size is call overhead and a slow tanh. Written out it is several times faster, and the flat
+parameters need no copying between learning and acting.
 """
 
 from itertools import pairwise
