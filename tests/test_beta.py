@@ -10,9 +10,11 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
-from mace_rl.beta import ExponentialSchedule, MetaAdaptation, MetaNetwork, alignment
+from mace_rl.beta import ExponentialSchedule, MetaAdaptation, alignment
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import ExponentialBeta, RunConfig
+from mace_rl.learner import Learner
+from mace_rl.meta_network import MetaNetwork
 from mace_rl.policy import Actor
 from mace_rl.ppo import PPO
 from mace_rl.rollout import Episode
@@ -42,6 +44,20 @@ def make(run_config):
         return MetaAdaptation(config, Environment(environment, 0))
 
     return build
+
+
+@pytest.fixture
+def learnt(monkeypatch) -> list[np.ndarray]:
+    """The gradients that reach learners, as they come."""
+    gradients = []
+    descend = Learner.descend
+
+    def note(self: Learner, gradient: np.ndarray) -> float:
+        gradients.append(gradient.copy())
+        return descend(self, gradient)
+
+    monkeypatch.setattr(Learner, "descend", note)
+    return gradients
 
 
 # --- The schedule -------------------------------------------------------------------------------
@@ -102,7 +118,7 @@ def test_sequence_is_state_action_reward_bonus(make):
         for t in range(6)
     ]
     found = controller.sequence(episode, bonus)
-    assert found.dtype == torch.float32
+    assert found.dtype == np.float32
     np.testing.assert_allclose(found, rows, rtol=1e-5)
 
 
@@ -113,8 +129,8 @@ def test_long_sequences_are_condensed(make, length):
     rng = np.random.default_rng(0)
     episode = episode_of(rng, Environment("Pendulum-v1", 0), length)
     bonus = rng.random(length)
-    whole = make("Pendulum-v1", max_sequence=None).sequence(episode, bonus).numpy()
-    found = make("Pendulum-v1", max_sequence=6).sequence(episode, bonus).numpy()
+    whole = make("Pendulum-v1", max_sequence=None).sequence(episode, bonus)
+    found = make("Pendulum-v1", max_sequence=6).sequence(episode, bonus)
     if length <= 6:
         assert (found == whole).all()
         return
@@ -127,25 +143,74 @@ def test_long_sequences_are_condensed(make, length):
         assert row[-1] == pytest.approx(math.log(1 + summed), rel=1e-5)
 
 
+class MetaTwin:
+    """A meta network in PyTorch, float64: an independent forward and backward."""
+
+    def __init__(self, network: MetaNetwork) -> None:
+        flat = network.parameters.astype(np.float64)
+        self.parts = [torch.tensor(part, requires_grad=True) for part in network.split(flat)]
+        self.lstm = torch.nn.LSTM(
+            network.input_size, network.units, batch_first=True, dtype=torch.float64
+        )
+
+    def __call__(self, sequence: np.ndarray) -> torch.Tensor:
+        inward, recurrent, bias, readout, readout_bias = self.parts
+
+        def theirs(weights: torch.Tensor) -> torch.Tensor:
+            """Gates last, in PyTorch's order and place."""
+            enter, forget, leave, candidate = weights.chunk(4, dim=-1)
+            return torch.cat([enter, forget, candidate, leave], dim=-1).movedim(-1, 0)
+
+        weights = {
+            "weight_ih_l0": theirs(inward),
+            "weight_hh_l0": theirs(recurrent),
+            "bias_ih_l0": theirs(bias),
+            "bias_hh_l0": torch.zeros_like(bias),
+        }
+        inputs = torch.from_numpy(sequence.astype(np.float64))[None]
+        _, (hidden, _) = torch.func.functional_call(self.lstm, weights, inputs)
+        return torch.sigmoid(readout @ hidden[0, 0] + readout_bias[0])
+
+    def gradient(self, loss: torch.Tensor) -> np.ndarray:
+        """∇ loss in the order of `MetaNetwork.parameters`."""
+        found = torch.autograd.grad(loss, self.parts)
+        return np.concatenate([part.numpy().ravel() for part in found])
+
+
+@pytest.mark.parametrize("units", [1, 5, 128])
+@pytest.mark.parametrize("length", [1, 2, 32, 300])
+def test_meta_network_and_its_gradient_equal_torch(run_config, units, length):
+    config = run_config("CartPole-v1", "mace_full", meta={"hidden_units": units}).meta
+    rng = np.random.default_rng(0)
+    network = MetaNetwork(7, config, 0.4, rng)
+    network.parameters[:] = rng.standard_normal(len(network.parameters)) / units**0.5
+    sequence = 2 * rng.standard_normal((length, 7)).astype(np.float32)
+    twin = MetaTwin(network)
+    expected = twin(sequence)
+    assert network(sequence) == pytest.approx(expected.item(), abs=1e-5)
+    gradient = twin.gradient(expected)
+    tolerance = 1e-4 * np.abs(gradient).max()
+    np.testing.assert_allclose(network.gradient(sequence), gradient, rtol=1e-3, atol=tolerance)
+
+
 def test_beta_of_the_next_episode_is_the_lstm_s_answer_to_the_last(make):
     """The recurrence written out (Hochreiter & Schmidhuber 1997, with a forget gate)."""
     controller = make(hidden_units=5)
     rng = np.random.default_rng(0)
     controller.next_episode(episode_of(rng, Environment("CartPole-v1", 0), 7), rng.random(7))
-    network, sequence = controller.network, controller.sources[-1].double().numpy()
-    weights = {name: value.double().numpy() for name, value in network.state_dict().items()}
+    network, sequence = controller.network, controller.sources[-1].astype(np.float64)
+    parts = network.split(network.parameters.astype(np.float64))
+    inward, recurrent, bias, readout, readout_bias = parts
 
     def logistic(x):
         return 1 / (1 + np.exp(-x))
 
     hidden, cell = np.zeros(5), np.zeros(5)
     for row in sequence:
-        gates = weights["lstm.weight_ih_l0"] @ row + weights["lstm.bias_ih_l0"]
-        gates += weights["lstm.weight_hh_l0"] @ hidden + weights["lstm.bias_hh_l0"]
-        enter, forget, candidate, leave = np.split(gates, 4)
+        enter, forget, leave, candidate = np.split(row @ inward + hidden @ recurrent + bias, 4)
         cell = logistic(forget) * cell + logistic(enter) * np.tanh(candidate)
         hidden = logistic(leave) * np.tanh(cell)
-    expected = logistic(weights["output.weight"][0] @ hidden + weights["output.bias"][0])
+    expected = logistic(readout @ hidden + readout_bias[0])
     assert controller.beta == pytest.approx(expected, abs=1e-6)
 
 
@@ -249,9 +314,9 @@ def test_alignment_by_hand():
 
 
 @pytest.mark.parametrize("credits", [[0.7], [-0.7], [0.5, -0.2, 0.9]])
-def test_lstm_receives_the_gradient_of_credit_times_beta(make, credits):
+def test_lstm_receives_the_gradient_of_credit_times_beta(make, learnt, credits):
     """Every parameter's gradient after `learn`, a sample of them against finite differences."""
-    controller = make(hidden_units=6, max_gradient_norm=1e9)
+    controller = make(hidden_units=6)
     environment, rng = Environment("CartPole-v1", 0), np.random.default_rng(0)
     for _ in range(len(credits) + 1):  # the first β is given, so one more
         controller.next_episode(episode_of(rng, environment), rng.random(20))
@@ -260,25 +325,21 @@ def test_lstm_receives_the_gradient_of_credit_times_beta(make, credits):
     extrinsic = np.array([1.0, 0.0], np.float32)
     intrinsic = [np.array([c, math.sqrt(1 - c * c)], np.float32) for c in credits]
     controller.learn(np.ones(2, np.float32), [np.ones(2, np.float32), *intrinsic])
-    before = [parameter.detach().clone() for parameter in controller.network.parameters()]
-    assert all(parameter.grad is None for parameter in controller.network.parameters())
+    twin = MetaTwin(controller.network)
+    assert not learnt
     controller.pending = controller.pending[1:]
     controller.learn(extrinsic, [])
-    gradients = [parameter.grad.clone() for parameter in controller.network.parameters()]
-    assert all(gradient.isfinite().all() for gradient in gradients)
-    assert all((gradient != 0).any() for gradient in gradients)
-
-    network = controller.network.double()
-    for parameter, value in zip(network.parameters(), before, strict=True):
-        parameter.data = value.double()
+    (gradient,) = learnt
+    assert np.isfinite(gradient).all()
+    assert all((part != 0).any() for part in controller.network.split(gradient))
 
     def mean_credited_beta() -> float:
         with torch.no_grad():
-            betas = [float(network(sequence.double())) for sequence in sequences]
+            betas = [twin(sequence).item() for sequence in sequences]
         return float(np.mean([c * beta for c, beta in zip(credits, betas, strict=True)]))
 
-    for parameter, gradient in zip(network.parameters(), gradients, strict=True):
-        flat, slopes = parameter.data.view(-1), gradient.view(-1)
+    for part, slopes in zip(twin.parts, controller.network.split(gradient), strict=True):
+        flat = part.data.view(-1)
         for i in rng.choice(len(flat), min(4, len(flat)), replace=False):
             original, values = float(flat[i]), []
             for step in (1e-5, -1e-5):
@@ -287,7 +348,7 @@ def test_lstm_receives_the_gradient_of_credit_times_beta(make, credits):
             flat[i] = original
             # Adam descends, so the gradient is that of minus the objective.
             expected = -(values[0] - values[1]) / 2e-5
-            assert float(slopes[i]) == pytest.approx(expected, rel=1e-3, abs=1e-7)
+            assert slopes.ravel()[i] == pytest.approx(expected, rel=1e-3, abs=1e-7)
 
 
 @pytest.mark.parametrize(("credit", "rises"), [(0.8, True), (-0.8, False)])
@@ -308,25 +369,28 @@ def test_beta_follows_what_helped_the_extrinsic_return(make, credit, rises):
 def test_without_credit_the_network_stays_as_it_is(make):
     """The first β is given, not chosen: nothing to learn from its effect."""
     controller = make()
-    before = [parameter.clone() for parameter in controller.network.parameters()]
+    before = controller.network.parameters.copy()
     controller.learn(np.ones(3), [np.ones(3)])  # the first rollout: nothing is pending
     controller.next_episode(
         episode_of(np.random.default_rng(0), Environment("CartPole-v1", 0)), np.zeros(20)
     )
     controller.learn(np.ones(3), [np.ones(3)])  # credits the first β
-    after = controller.network.parameters()
-    assert all((a == b).all() for a, b in zip(before, after, strict=True))
-    assert all(learner.time == 0 for learner in controller.learners)
+    assert (controller.network.parameters == before).all()
+    assert controller.learner.time == 0
 
 
 # --- Which β is credited with what --------------------------------------------------------------
 
 
 class Watched(Trainer):
-    """Keeps, round by round, what was played, by which weights, and what reached the LSTM."""
+    """Keeps, round by round, what was played, by which weights, and what reached the LSTM.
 
-    def __init__(self, config: RunConfig) -> None:
+    learnt: the gradients that reached any learner so far.
+    """
+
+    def __init__(self, config: RunConfig, learnt: list[np.ndarray]) -> None:
         super().__init__(config)
+        self.learnt = learnt
         self.rounds: list[Round] = []
 
     def collect(self) -> list[Experience]:
@@ -335,12 +399,10 @@ class Watched(Trainer):
 
     def adapt(self, rollout: list[Experience]) -> None:
         assert (self.played_by == self.ppo.actor.parameters).all()  # before the update
-        network = self.controller.network
-        meta = copy.deepcopy(network)
-        network.zero_grad()
+        meta = MetaTwin(self.controller.network)
+        before = len(self.learnt)
         super().adapt(rollout)
-        gradients = [parameter.grad for parameter in network.parameters()]
-        learnt = None if gradients[0] is None else [g.clone() for g in gradients]
+        learnt = self.learnt[before:]
         changes = [change.copy() for _, change in self.controller.pending]
         self.rounds.append(Round(rollout, self.played_by, meta, changes, learnt))
 
@@ -350,9 +412,9 @@ class Round(NamedTuple):
 
     rollout: list[Experience]
     policy: np.ndarray  # the actor's parameters that played it
-    meta: MetaNetwork  # as it was while it was played
+    meta: MetaTwin  # as it was while it was played
     changes: list[np.ndarray]  # for each of its episodes the change of the update by its β
-    learnt: list[torch.Tensor] | None  # the gradient that reached the meta network after it
+    learnt: list[np.ndarray]  # the gradient, if any, that reached the meta network after it
 
 
 @pytest.fixture(params=["CartPole-v1", "Pendulum-v1"])
@@ -361,7 +423,7 @@ def environment(request) -> str:
 
 
 @pytest.fixture(params=["an episode", "several episodes"])
-def watched(request, environment, run_config) -> Watched:
+def watched(request, environment, run_config, learnt) -> Watched:
     """A finished short run; a rollout is one episode, or several."""
     steps = {"CartPole-v1": 80, "Pendulum-v1": 400}[environment]
     several = request.param == "several episodes"
@@ -372,15 +434,16 @@ def watched(request, environment, run_config) -> Watched:
             2,
             episodes=12,
             ppo={"rollout_steps": steps if several else 1, "gae_lambda": 0.95},
-            meta={"max_gradient_norm": 1e9, "hidden_units": 16},
-        )
+            meta={"hidden_units": 16},
+        ),
+        learnt,
     )
     assert [record.episode for records in trainer.run() for record in records] == [*range(1, 13)]
     assert (max(len(each.rollout) for each in trainer.rounds) > 1) == several
     return trainer
 
 
-def read_sequences(trainer: Watched) -> list[torch.Tensor]:
+def read_sequences(trainer: Watched) -> list[np.ndarray]:
     """What the LSTM reads of each episode, standardised by all states up to its end."""
     reader = MetaAdaptation(trainer.config, trainer.environment)
     sequences, observed = [], []
@@ -394,13 +457,12 @@ def read_sequences(trainer: Watched) -> list[torch.Tensor]:
 
 
 def test_each_beta_comes_from_the_episode_before(watched):
-    """From the meta network as it was when that episode ended; the first one is given."""
+    """From the meta network as it has learnt from all rounds before; the first one is given."""
     sequences = read_sequences(watched)
     played = [(item.beta, each.meta) for each in watched.rounds for item in each.rollout]
     assert played[0][0] == 0.4
-    for (_, meta), sequence, (beta, _) in zip(played, sequences, played[1:], strict=False):
-        with torch.no_grad():
-            assert beta == pytest.approx(float(meta(sequence)), abs=1e-5)
+    for sequence, (beta, meta) in zip(sequences, played[1:], strict=False):
+        assert beta == pytest.approx(meta(sequence).item(), abs=1e-5)
     betas = [beta for beta, _ in played]
     assert betas == [record.beta for record in watched.records]
     assert len(set(betas)) == 12 and all(0 < beta < 1 for beta in betas)
@@ -448,7 +510,7 @@ def test_each_beta_is_credited_with_its_own_effect(watched, twin):
     credit × β of the sequence that chose its β.
     """
     chosen_from = [None, *read_sequences(watched)]  # by episode, from 0
-    assert watched.rounds[0].learnt is None
+    assert watched.rounds[0].learnt == []
     start = 0
     for before, after in pairwise(watched.rounds):
         advantages = np.concatenate([item.extrinsic_advantages for item in after.rollout])
@@ -461,14 +523,13 @@ def test_each_beta_is_credited_with_its_own_effect(watched, twin):
         ]
         start += len(before.rollout)
         if not terms:  # only the first β, which was given
-            assert after.learnt is None
+            assert after.learnt == []
             continue
-        loss = -sum(terms) / len(terms)
-        expected = torch.autograd.grad(loss, list(after.meta.parameters()))
-        largest = max(float(gradient.abs().max()) for gradient in expected)
+        expected = after.meta.gradient(-sum(terms) / len(terms))
+        largest = np.abs(expected).max()
         assert largest > 0
-        for found, gradient in zip(after.learnt, expected, strict=True):
-            np.testing.assert_allclose(found, gradient, rtol=1e-2, atol=2e-3 * largest)
+        (found,) = after.learnt
+        np.testing.assert_allclose(found, expected, rtol=1e-2, atol=2e-3 * largest)
 
 
 def test_restored_controller_continues_to_the_bit(make):
@@ -489,7 +550,4 @@ def test_restored_controller_continues_to_the_bit(make):
     for several in (True, False, False):
         step([original, restored], several)
         assert original.beta == restored.beta
-    for one, other in zip(
-        original.network.parameters(), restored.network.parameters(), strict=True
-    ):
-        assert (one == other).all()
+    assert (original.network.parameters == restored.network.parameters).all()

@@ -61,9 +61,7 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, roll
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
     fixed = finish(run_config(environment, "mace_fixed", 3, beta=zero, **changes))
-    monkeypatch.setattr(
-        MetaAdaptation, "beta", property(lambda self: 0.0, lambda self, value: None), raising=False
-    )
+    monkeypatch.setattr(MetaAdaptation, "beta", property(lambda self: 0.0))
     full = finish(run_config(environment, "mace_full", 3, **changes))
     for trainer in (fixed, full):
         assert without_bonus(trainer.records) == without_bonus(plain.records)
@@ -73,12 +71,7 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, roll
         assert sum(record.intrinsic_return for record in trainer.records) > 10
         assert len(trainer.curiosity.memory) > 0
     untrained = Trainer(full.config).controller.network
-    assert not same_parameters(full.controller.network, untrained)
-
-
-def same_parameters(one: torch.nn.Module, other: torch.nn.Module) -> bool:
-    pairs = zip(one.parameters(), other.parameters(), strict=True)
-    return all(torch.equal(a, b) for a, b in pairs)
+    assert (full.controller.network.parameters != untrained.parameters).any()
 
 
 def test_beta_above_0_changes_what_is_learnt(run_config):
@@ -187,20 +180,20 @@ def test_it_learns_what_pays(run_config, register, variant):
 
 
 @pytest.mark.slow
-def test_meta_network_learns_and_beta_moves(run_config):
+def test_meta_network_learns_and_beta_moves(run_config, monkeypatch):
     trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=60))
-    initial = copy.deepcopy(trainer.controller.network)
-    norms = []
+    network, learner = trainer.controller.network, trainer.controller.learner
+    initial, norms = network.parameters.copy(), []
+    descend = learner.descend
+    monkeypatch.setattr(learner, "descend", lambda slope: norms.append(descend(slope)))
     for _ in trainer.run():
-        gradients = [p.grad for p in trainer.controller.network.parameters()]
-        if gradients[0] is not None:
-            norms.append(float(torch.cat([g.ravel() for g in gradients]).norm()))
+        pass
     assert len(norms) == 58  # the first β is given; the effect of the last is never seen
     assert all(0 < norm < np.inf for norm in norms)
     for before, after in zip(
-        initial.parameters(), trainer.controller.network.parameters(), strict=True
+        network.split(initial), network.split(network.parameters), strict=True
     ):
-        assert (before != after).any() and after.isfinite().all()
+        assert (before != after).any() and np.isfinite(after).all()
     betas = [record.beta for record in trainer.records]
     assert betas[0] == 0.4 and len(set(betas)) == 60 and np.ptp(betas) > 0.02
     assert all(0 < beta < 1 for beta in betas)
@@ -411,9 +404,8 @@ def test_bad_density_stops_the_run(run_config):
 
 def test_bad_beta_stops_the_run(run_config):
     trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9))
-    with torch.no_grad():
-        trainer.controller.network.output.bias[:] = np.nan
-    with pytest.raises(NonFiniteError, match=r"CartPole-v1 mace_full seed 0, episode 1: β is nan"):
+    trainer.controller.network.readout_bias[:] = np.nan
+    with pytest.raises(NonFiniteError, match=r"CartPole-v1 mace_full seed 0, episode 2: β is nan"):
         for _ in trainer.run():
             pass
 

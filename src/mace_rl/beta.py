@@ -5,19 +5,20 @@ behind it.
 """
 
 from collections import deque
+from functools import reduce
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from gymnasium.spaces import Discrete
-from torch import Tensor, nn
 
 from mace_rl.environments import Environment
-from mace_rl.hyperparameters import ExponentialBeta, MetaConfig, RunConfig
+from mace_rl.hyperparameters import ExponentialBeta, RunConfig
 from mace_rl.learner import Learner
+from mace_rl.meta_network import MetaNetwork
 from mace_rl.rollout import Episode
 from mace_rl.standardise import RunningStandardiser
-from mace_rl.streams import torch_generator
+from mace_rl.streams import numpy_generator
 
 
 class BetaController(Protocol):
@@ -73,28 +74,6 @@ class ExponentialSchedule:
         self.episodes = state["episodes"]
 
 
-class MetaNetwork(nn.Module):
-    """LSTM over one episode, its last state mapped to β in (0, 1)."""
-
-    def __init__(
-        self, input_size: int, config: MetaConfig, initial: float, generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        self.lstm = nn.LSTM(input_size, config.hidden_units, batch_first=True)
-        self.output = nn.Linear(config.hidden_units, 1)
-        bound = config.hidden_units**-0.5
-        for parameter in self.parameters():
-            nn.init.uniform_(parameter, -bound, bound, generator=generator)
-        # Untrained it answers about `initial` to every episode.
-        nn.init.uniform_(self.output.weight, -0.01, 0.01, generator=generator)
-        nn.init.constant_(self.output.bias, float(np.log(initial / (1 - initial))))
-
-    def forward(self, sequence: Tensor) -> Tensor:
-        """β, [], from one episode, [T, input]."""
-        _, (hidden, _) = self.lstm(sequence[None])
-        return torch.sigmoid(self.output(hidden[-1, 0]))[0]
-
-
 class MetaAdaptation:
     """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
 
@@ -118,29 +97,31 @@ class MetaAdaptation:
             environment.observation_size + action_size + 2,
             self.config,
             config.beta.initial,
-            torch_generator(config.seed, "meta"),
+            numpy_generator(config.seed, "meta"),
         )
-        self.learners = [
-            Learner(parameter.detach().view(-1).numpy(), self.config.learning_rate)
-            for parameter in self.network.parameters()
-        ]
+        self.learner = Learner(
+            self.network.parameters, self.config.learning_rate, self.config.max_gradient_norm
+        )
         self.standardiser = RunningStandardiser(environment.observation_size)
-        self.beta: float = config.beta.initial
-        # What gave rise to the β of each episode since the last `learn`, and to that of the next;
-        # None for the first episode, whose β is given.
-        self.sources: deque[Tensor | None] = deque([None])
+        self.initial = config.beta.initial
+        # What the LSTM read for the β of each episode since the last `learn`, and for that of the
+        # next; None for the first episode, whose β is given.
+        self.sources: deque[np.ndarray | None] = deque([None])
         # The same with dg/dβ for the episodes of the last rollout, whose effect is not yet known.
-        self.pending: list[tuple[Tensor | None, np.ndarray]] = []
+        self.pending: list[tuple[np.ndarray | None, np.ndarray]] = []
+
+    @property
+    def beta(self) -> float:
+        """See `BetaController`; from the network as it is now."""
+        source = self.sources[-1]
+        return self.initial if source is None else self.network(source)
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         self.standardiser.update(episode.observations[:-1])
-        sequence = self.sequence(episode, bonus)
-        self.sources.append(sequence)
-        with torch.no_grad():
-            self.beta = float(self.network(sequence))
+        self.sources.append(self.sequence(episode, bonus))
 
-    def sequence(self, episode: Episode, bonus: np.ndarray) -> Tensor:
+    def sequence(self, episode: Episode, bonus: np.ndarray) -> np.ndarray:
         """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
 
         float32 [min(T, max_sequence), input]. Longer episodes are cut into equal stretches: mean
@@ -159,44 +140,45 @@ class MetaAdaptation:
             seen = np.add.reduceat(seen, starts) / counts[:, None]
             rewards = np.add.reduceat(rewards, starts)
         rewards = np.sign(rewards) * np.log1p(np.abs(rewards))
-        return torch.from_numpy(np.concatenate([seen, rewards], axis=1).astype(np.float32))
+        return np.concatenate([seen, rewards], axis=1).astype(np.float32)
 
     def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> None:
         """See `BetaController`: credit the βs of the last rollout, then remember this one's."""
-        credited = [
-            (sequence, alignment(extrinsic, gradient))
-            for sequence, gradient in self.pending
-            if sequence is not None
-        ]
+        credited = [(sequence, change) for sequence, change in self.pending if sequence is not None]
         if credited:
-            loss = -sum(self.network(sequence) * credit for sequence, credit in credited)
-            self.network.zero_grad()
-            (loss / len(credited)).backward()
-            nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_gradient_norm)
-            for learner, parameter in zip(self.learners, self.network.parameters(), strict=True):
-                learner.descend(parameter.grad.view(-1).numpy())
-        self.pending = [(self.sources.popleft(), gradient) for gradient in intrinsic]
+            # Adam descends, so what it gets is minus the mean.
+            gradients = (
+                self.network.gradient(sequence, -alignment(extrinsic, change) / len(credited))
+                for sequence, change in credited
+            )
+            self.learner.descend(reduce(np.add, gradients))
+        self.pending = [(self.sources.popleft(), change) for change in intrinsic]
 
     def state_dict(self) -> dict[str, Any]:
         """See `BetaController`."""
         return {
-            "learners": [learner.state_dict() for learner in self.learners],
+            "learner": self.learner.state_dict(),
             "standardiser": self.standardiser.state_dict(),
-            "beta": self.beta,
-            "sources": list(self.sources),
-            "pending": [
-                (sequence, torch.from_numpy(gradient)) for sequence, gradient in self.pending
-            ],
+            "sources": [as_tensor(source) for source in self.sources],
+            "pending": [(as_tensor(source), as_tensor(change)) for source, change in self.pending],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `BetaController`."""
-        for learner, saved in zip(self.learners, state["learners"], strict=True):
-            learner.load_state_dict(saved)
+        self.learner.load_state_dict(state["learner"])
         self.standardiser.load_state_dict(state["standardiser"])
-        self.beta = state["beta"]
-        self.sources = deque(state["sources"])
-        self.pending = [(sequence, gradient.numpy()) for sequence, gradient in state["pending"]]
+        self.sources = deque(as_array(source) for source in state["sources"])
+        self.pending = [(as_array(source), as_array(change)) for source, change in state["pending"]]
+
+
+def as_tensor(array: np.ndarray | None) -> torch.Tensor | None:
+    """For a checkpoint."""
+    return None if array is None else torch.from_numpy(array)
+
+
+def as_array(tensor: torch.Tensor | None) -> np.ndarray | None:
+    """From a checkpoint."""
+    return None if tensor is None else tensor.numpy()
 
 
 def alignment(extrinsic: np.ndarray, change: np.ndarray) -> float:

@@ -1,10 +1,13 @@
-"""The compiled inner loops of acting: forward pass, sampling, classic-control episodes (numba).
+"""The compiled inner loops (numba): networks, acting, classic-control episodes.
 
-Acting is one matrix-vector product a layer, far too little work for a tensor library's call
-overhead. Everything here is float32 in a fixed order of operations, so the ordinary rollout,
-which calls `act_discrete` or `act_box` step by step, and the compiled one, which runs the same
-functions inside its loop, take the same actions to the bit. All compiled functions stand in this
-one file because numba's on-disk cache does not notice changes in other files.
+Networks of 64 units are too small for a tensor library, whose calls cost more than the work in
+them. Everything here is float32 in a fixed order of operations, so the ordinary rollout, which
+calls `act_discrete` or `act_box` step by step, and the compiled one, which runs the same functions
+inside its loop, take the same actions to the bit.
+
+A network is a flat vector of parameters, per layer the weights [in, out] row by row, then the
+biases [out], and its sizes, int64 [layers + 1]. All compiled functions that call one another stand
+in this one file because numba's on-disk cache does not notice changes in other files.
 """
 
 import math
@@ -14,32 +17,270 @@ from numba import njit
 
 CARTPOLE, ACROBOT = 0, 1
 
+# "contract" lets a product and a sum become one instruction; division by zero is Inf, not an error,
+# which would keep loops from becoming vector operations.
+kernel = njit(cache=True, fastmath={"contract"}, error_model="numpy")
 
-@njit(cache=True)
-def forward(observation, parameters, sizes):
-    """Output of a tanh MLP for one observation.
 
-    observation: float32 [sizes[0]]; parameters: float32, per layer the weights [in, out] row by
-    row, then the biases [out]; sizes: int64 [layers + 1]. Returns float32 [sizes[-1]].
+@kernel
+def tanh(x):
+    """Hyperbolic tangent of a float32 or float64 to 2e-7, as arithmetic that loops vectorise.
+
+    tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction cut off
+    after its seventh term, whose error up to y = 4.6 is 2e-9. From x = 9.2 on all is 1 in float32.
     """
-    activation = observation
-    offset = 0
+    y = x * np.float32(0.5)
+    y = min(max(y, np.float32(-4.6)), np.float32(4.6))
+    s = y * y
+    p = y * (((s + np.float32(378)) * s + np.float32(17325)) * s + np.float32(135135))
+    q = ((np.float32(28) * s + np.float32(3150)) * s + np.float32(62370)) * s + np.float32(135135)
+    return np.float32(2) * p * q / (q * q + p * p)
+
+
+@kernel
+def network_outputs(activations, parameters, sizes):
+    """Fill in a tanh network's activations for N inputs.
+
+    activations: the inputs, [N, sizes[0]], then an array to fill for each layer, [N, sizes[1]] ...,
+    the outputs last; contiguous and of one type, as a tuple.
+    """
+    start = 0
     for layer in range(len(sizes) - 1):
         inputs, outputs = sizes[layer], sizes[layer + 1]
-        biases = offset + inputs * outputs
-        result = parameters[biases : biases + outputs].copy()
+        biases = start + inputs * outputs
+        result = activations[layer + 1]
+        np.dot(activations[layer], parameters[start:biases].reshape(inputs, outputs), result)
+        start = biases + outputs
+        bias = parameters[biases:start]
+        if layer < len(sizes) - 2:
+            for n in range(len(result)):
+                for j in range(outputs):
+                    result[n, j] = tanh(result[n, j] + bias[j])
+        else:
+            for n in range(len(result)):
+                for j in range(outputs):
+                    result[n, j] += bias[j]
+
+
+@kernel
+def network_gradient(activations, slope, parameters, sizes):
+    """Gradient, [n], with respect to the parameters of a loss.
+
+    slope: the loss's gradient with respect to the outputs, [N, out]; activations: as
+    `network_outputs` left them. Parameters past the last layer's get 0.
+    """
+    gradient = np.zeros_like(parameters)
+    end = 0
+    for layer in range(len(sizes) - 1):
+        end += (sizes[layer] + 1) * sizes[layer + 1]
+    for layer in range(len(sizes) - 2, -1, -1):
+        inputs, outputs = sizes[layer], sizes[layer + 1]
+        biases = end - outputs
+        start = biases - inputs * outputs
+        hidden = activations[layer]
+        np.dot(hidden.T, slope, gradient[start:biases].reshape(inputs, outputs))
+        bias = gradient[biases:end]
+        for n in range(len(slope)):
+            for j in range(outputs):
+                bias[j] += slope[n, j]
+        if layer > 0:
+            weights = parameters[start:biases].reshape(inputs, outputs)
+            slope = np.dot(slope, weights.T)
+            flat, flat_hidden = slope.ravel(), hidden.ravel()
+            for k in range(len(flat)):
+                flat[k] *= np.float32(1) - flat_hidden[k] * flat_hidden[k]  # tanh'
+        end = start
+    return gradient
+
+
+@kernel
+def forward(observation, parameters, sizes):
+    """Output of a tanh network for one observation, [sizes[0]]; float32 [sizes[-1]]."""
+    activation = observation
+    start = 0
+    for layer in range(len(sizes) - 1):
+        inputs, outputs = sizes[layer], sizes[layer + 1]
+        biases = start + inputs * outputs
+        weights = parameters[start:biases].reshape(inputs, outputs)
+        start = biases + outputs
+        result = parameters[biases:start].copy()
         # Inputs outside, outputs inside: the inner loop is a vector operation without reduction.
         for i in range(inputs):
-            value = activation[i]
-            row = offset + i * outputs
-            for j in range(outputs):
-                result[j] += value * parameters[row + j]
+            value, row = activation[i], weights[i]
+            for j in range(len(result)):
+                result[j] += value * row[j]
         if layer < len(sizes) - 2:
-            for j in range(outputs):
-                result[j] = math.tanh(result[j])
+            for j in range(len(result)):
+                result[j] = tanh(result[j])
         activation = result
-        offset = biases + outputs
     return activation
+
+
+@kernel
+def log_sum_exp(logits):
+    """log Σ exp of a vector, without overflow."""
+    largest = logits[0]
+    for logit in logits:
+        largest = max(largest, logit)
+    total = np.float32(0.0)
+    for logit in logits:
+        total += math.exp(logit - largest)
+    return largest + math.log(total)
+
+
+@kernel
+def categorical_log_probs(logits, actions):
+    """log π(a|s), [N], of a softmax policy; logits: [N, actions], actions: int64 [N]."""
+    result = np.empty(len(logits), logits.dtype)
+    for n in range(len(logits)):
+        result[n] = logits[n, actions[n]] - log_sum_exp(logits[n])
+    return result
+
+
+@kernel
+def categorical_slope(logits, actions, weights, entropy_weight):
+    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at the logits.
+
+    logits: [N, actions]; actions: int64 [N]; weights: [N].
+    """
+    slope = np.empty_like(logits)
+    for n in range(len(logits)):
+        log_total = log_sum_exp(logits[n])
+        entropy = 0.0
+        for j in range(logits.shape[1]):
+            log_prob = logits[n, j] - log_total
+            entropy -= math.exp(log_prob) * log_prob
+        for j in range(logits.shape[1]):
+            log_prob = logits[n, j] - log_total
+            prob = math.exp(log_prob)
+            slope[n, j] = -prob * (weights[n] + entropy_weight * (log_prob + entropy))
+        slope[n, actions[n]] += weights[n]
+    return slope
+
+
+@kernel
+def gaussian_log_probs(means, log_std, actions):
+    """log π(a|s) of a diagonal Gaussian policy, [N]; means and actions: [N, actions]."""
+    inverse_std = np.exp(-log_std)
+    constant = log_std.sum() + 0.5 * math.log(2 * math.pi) * len(log_std)
+    result = np.empty(len(means), means.dtype)
+    for n in range(len(means)):
+        squares = 0.0
+        for j in range(len(log_std)):
+            squares += ((actions[n, j] - means[n, j]) * inverse_std[j]) ** 2
+        result[n] = -0.5 * squares - constant
+    return result
+
+
+@kernel
+def gaussian_slopes(means, log_std, actions, weights, entropy_weight):
+    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at the means and log_std.
+
+    means and actions: [N, actions]; weights: [N]. Returns arrays like `means` and `log_std`.
+    """
+    inverse_std = np.exp(-log_std)
+    slope = np.empty_like(means)
+    log_std_slope = np.full_like(log_std, entropy_weight * len(means))
+    for n in range(len(means)):
+        for j in range(len(log_std)):
+            deviation = (actions[n, j] - means[n, j]) * inverse_std[j]
+            slope[n, j] = weights[n] * deviation * inverse_std[j]
+            log_std_slope[j] += weights[n] * (deviation * deviation - 1)
+    return slope, log_std_slope
+
+
+@kernel
+def surrogate_weights(log_probs, old_log_probs, advantages, clip):
+    """What the gradient of PPO's mean clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
+
+    The surrogate min(rA, clip(r)A), with ratio r, is flat where the ratio is already past the bound
+    that the advantage pushes it to; elsewhere its gradient is r A ∇ log π.
+    """
+    weights = np.zeros(len(log_probs), np.float32)
+    for n in range(len(weights)):
+        ratio, advantage = math.exp(log_probs[n] - old_log_probs[n]), advantages[n]
+        flat = ratio > 1 + clip if advantage > 0 else ratio < 1 - clip
+        if not flat:
+            weights[n] = ratio * advantage / len(weights)
+    return weights
+
+
+@kernel
+def sigmoid(x):
+    """The logistic function of a float32 or float64."""
+    return np.float32(0.5) + np.float32(0.5) * tanh(np.float32(0.5) * x)
+
+
+@kernel
+def quarters(vector):
+    """Four views of a vector, [4 H]."""
+    size = len(vector) // 4
+    return vector[:size], vector[size : 2 * size], vector[2 * size : 3 * size], vector[3 * size :]
+
+
+@kernel
+def lstm_states(sequence, inward, recurrent, bias):
+    """Long short-term memory over a sequence, [T, in], from a zero state.
+
+    inward: [in, 4 H], recurrent: [H, 4 H], bias: [4 H], for H units, whose columns are the input,
+    forget and output gates and the new content. Returns these four in one array, [T, 4 H], the
+    cells' contents and their outputs, [T + 1, H] each, the zero state included.
+    """
+    size = len(recurrent)
+    gates = np.dot(sequence, inward)
+    cells = np.zeros((len(sequence) + 1, size), gates.dtype)
+    outputs = np.zeros_like(cells)
+    for t in range(len(sequence)):
+        gate, cell, output = gates[t], cells[t + 1], outputs[t + 1]
+        recurring, before = np.dot(outputs[t], recurrent), cells[t]
+        for j in range(3 * size):
+            gate[j] = sigmoid(gate[j] + recurring[j] + bias[j])
+        for j in range(3 * size, 4 * size):
+            gate[j] = tanh(gate[j] + recurring[j] + bias[j])
+        let_in, keep, let_out, new = quarters(gate)
+        for j in range(size):
+            cell[j] = keep[j] * before[j] + let_in[j] * new[j]
+            output[j] = let_out[j] * tanh(cell[j])
+    return gates, cells, outputs
+
+
+@kernel
+def lstm_gradients(
+    sequence,
+    recurrent,
+    gates,
+    cells,
+    outputs,
+    slope,
+    inward_gradient,
+    recurrent_gradient,
+    bias_gradient,
+):
+    """Fill in the gradients with respect to weights and bias, by backpropagation in time.
+
+    slope: the loss's gradient with respect to the last output, [H]; gates, cells and outputs as
+    `lstm_states` returned them.
+    """
+    size, one = len(recurrent), np.float32(1)
+    slopes = np.empty_like(gates)
+    cell_slope = np.zeros_like(slope)
+    backward = recurrent.T
+    for t in range(len(sequence) - 1, -1, -1):
+        let_in, keep, let_out, new = quarters(gates[t])
+        let_in_slope, keep_slope, let_out_slope, new_slope = quarters(slopes[t])
+        cell, before = cells[t + 1], cells[t]
+        for j in range(size):
+            shown = tanh(cell[j])
+            let_out_slope[j] = slope[j] * shown * let_out[j] * (one - let_out[j])
+            cell_slope[j] += slope[j] * let_out[j] * (one - shown * shown)
+            let_in_slope[j] = cell_slope[j] * new[j] * let_in[j] * (one - let_in[j])
+            keep_slope[j] = cell_slope[j] * before[j] * keep[j] * (one - keep[j])
+            new_slope[j] = cell_slope[j] * let_in[j] * (one - new[j] * new[j])
+            cell_slope[j] *= keep[j]
+        slope = np.dot(slopes[t], backward)
+    np.dot(sequence.T, slopes, inward_gradient)
+    np.dot(outputs[:-1].T, slopes, recurrent_gradient)
+    bias_gradient[:] = slopes.sum(axis=0)
 
 
 @njit(cache=True)

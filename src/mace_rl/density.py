@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numba import njit
 
 from mace_rl.network import MLP
 
@@ -29,25 +30,37 @@ class MADE(MLP):
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, [N, size] → [N]."""
-        deviations, log_std = self._standardised(x, self.forward(x)[-1])
+        mean, log_std = self._moments(self.forward(x))
+        deviations = (x - mean) * np.exp(-log_std)
         constant = np.float32(0.5 * math.log(2 * math.pi))
         return (-0.5 * deviations * deviations - log_std - constant).sum(axis=1)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """∇ of the mean log-density of the rows of x, [N, size], with respect to `parameters`."""
         activations = self.forward(x)
-        outputs = activations[-1]
-        deviations, log_std = self._standardised(x, outputs)
-        slope = np.empty_like(outputs)
-        mean_slope, log_std_slope = np.split(slope, 2, axis=1)
-        mean_slope[:] = deviations * np.exp(-log_std)
-        log_std_slope[:] = deviations * deviations - 1
-        log_std_slope *= outputs[:, x.shape[1] :] > SMALLEST_LOG_STD
-        slope /= len(x)
+        mean, log_std = self._moments(activations)
+        slope = gaussian_slope(activations[0], mean, log_std, np.exp(-log_std))
         return self.backward(activations, slope) * self.mask
 
-    def _standardised(self, x: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(x - μ) / σ and log σ, [N, size] each, from the network's outputs, [N, 2 size]."""
-        mean, log_std = np.split(outputs, 2, axis=1)
-        log_std = np.maximum(log_std, np.float32(SMALLEST_LOG_STD))
-        return (x - mean) * np.exp(-log_std), log_std
+    def _moments(self, activations: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """μ and log σ, [N, size] each, from what `forward` returned."""
+        mean, log_std = np.split(activations[-1], 2, axis=1)
+        return mean, np.maximum(log_std, np.float32(SMALLEST_LOG_STD))
+
+
+@njit(cache=True, error_model="numpy")
+def gaussian_slope(x, mean, log_std, inverse_std):
+    """Gradient of the mean of log N(x; μ, σ) with respect to μ and log σ, [N, 2 size].
+
+    All arguments are [N, size]; log σ at its lower bound has no gradient.
+    """
+    count, size = x.shape
+    slope = np.empty((count, 2 * size), x.dtype)
+    for n in range(count):
+        mean_slope, log_std_slope = slope[n, :size], slope[n, size:]
+        for i in range(size):
+            deviation = (x[n, i] - mean[n, i]) * inverse_std[n, i]
+            mean_slope[i] = deviation * inverse_std[n, i] / count
+            free = log_std[n, i] > SMALLEST_LOG_STD
+            log_std_slope[i] = (deviation * deviation - 1) / count if free else 0.0
+    return slope

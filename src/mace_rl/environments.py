@@ -81,12 +81,12 @@ class Environment:
             self.env.reset(seed=int(sequence(seed, "environment").generate_state(1)[0]))
 
     def encode(self, observation: Any) -> np.ndarray:
-        """`observation` as a float32 vector, [observation_size]."""
+        """`observation` as a float32 vector, [observation_size]; may be the same memory."""
         if self.discrete_observations:
             vector = np.zeros(self.observation_size, np.float32)
             vector[int(observation) - int(self.observation_space.start)] = 1.0
             return vector
-        return np.array(observation, np.float32).ravel()  # a copy: some reuse theirs
+        return np.asarray(observation, np.float32).ravel()
 
     @property
     def generator(self) -> np.random.Generator:

@@ -12,7 +12,7 @@ import torch
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def adam(parameters, gradient, mean, square, time, learning_rate):
     """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; all arrays float32 [n].
 

@@ -1,14 +1,12 @@
 """The policy π(a|s), and its gradient."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from mace_rl import compiled
 from mace_rl.network import MLP
-
-HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
 
 class ActingPolicy(NamedTuple):
@@ -66,25 +64,17 @@ class Actor(MLP):
         )
 
     def log_probs(self, outputs: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """log π(a|s), float32 [N], from the network's outputs, [N, out], and actions.
+        """log π(a|s), [N], from the network's outputs, [N, out], and actions.
 
         actions: int64 [N] or float32 [N, actions].
         """
         if self.discrete:
-            return log_softmax(outputs)[np.arange(len(actions)), actions]
-        deviations = (actions - outputs) * np.exp(-self.log_std)
-        return (-0.5 * deviations * deviations - self.log_std - np.float32(HALF_LOG_TAU)).sum(1)
-
-    def entropy(self, outputs: np.ndarray) -> np.ndarray:
-        """Entropy of π(·|s), float32 [N], from the network's outputs, [N, out]."""
-        if self.discrete:
-            log_probs = log_softmax(outputs)
-            return -(np.exp(log_probs) * log_probs).sum(1)
-        return np.full(len(outputs), (self.log_std + 0.5 + HALF_LOG_TAU).sum(), np.float32)
+            return compiled.categorical_log_probs(outputs, actions)
+        return compiled.gaussian_log_probs(outputs, self.log_std, actions)
 
     def gradient(
         self,
-        activations: list[np.ndarray],
+        activations: tuple[np.ndarray, ...],
         actions: np.ndarray,
         weights: np.ndarray,
         entropy_weight: float = 0.0,
@@ -95,24 +85,11 @@ class Actor(MLP):
         """
         outputs = activations[-1]
         if self.discrete:
-            log_probs = log_softmax(outputs)
-            probs = np.exp(log_probs)
-            slope = -weights[:, None] * probs
-            slope[np.arange(len(actions)), actions] += weights
-            if entropy_weight:
-                entropy = -(probs * log_probs).sum(1, keepdims=True)
-                slope -= np.float32(entropy_weight) * probs * (log_probs + entropy)
+            slope = compiled.categorical_slope(outputs, actions, weights, entropy_weight)
             return self.backward(activations, slope)
-        inverse_std = np.exp(-self.log_std)
-        deviations = (actions - outputs) * inverse_std
-        gradient = self.backward(activations, weights[:, None] * deviations * inverse_std)
-        gradient[-self.sizes[-1] :] = weights @ (
-            deviations * deviations - 1
-        ) + entropy_weight * len(outputs)
+        slope, log_std_slope = compiled.gaussian_slopes(
+            outputs, self.log_std, actions, weights, entropy_weight
+        )
+        gradient = self.backward(activations, slope)
+        gradient[-len(log_std_slope) :] = log_std_slope
         return gradient
-
-
-def log_softmax(logits: np.ndarray) -> np.ndarray:
-    """Row-wise log-softmax, [N, actions]."""
-    shifted = logits - logits.max(axis=1, keepdims=True)
-    return shifted - np.log(np.exp(shifted).sum(axis=1, keepdims=True))

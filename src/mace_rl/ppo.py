@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from mace_rl import compiled
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import PPOConfig
 from mace_rl.learner import Learner
@@ -125,22 +126,18 @@ class PPO:
     def actor_gradient(self, batch: Batch, index: Any = slice(None)) -> np.ndarray:
         """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
 
-        `index` chooses the steps of a minibatch. The surrogate min(rA, clip(r)A), with ratio r, is
-        flat where the ratio is already past the bound that the advantage pushes it to; elsewhere
-        its gradient is r A ∇log π.
+        `index` chooses the steps of a minibatch.
         """
-        actions, advantage = batch.actions[index], batch.advantages[index]
+        actions, advantages = batch.actions[index], batch.advantages[index]
         activations = self.actor.forward(batch.observations[index])
-        ratio = np.exp(self.actor.log_probs(activations[-1], actions) - batch.log_probs[index])
-        clip = self.config.clip
-        flat = np.where(advantage > 0, ratio > 1 + clip, ratio < 1 - clip)
-        count = len(advantage)
-        return -self.actor.gradient(
-            activations,
-            actions,
-            np.where(flat, 0, ratio * advantage / count).astype(np.float32),
-            self.config.entropy_coefficient / count,
+        weights = compiled.surrogate_weights(
+            self.actor.log_probs(activations[-1], actions),
+            batch.log_probs[index],
+            advantages,
+            self.config.clip,
         )
+        entropy_weight = self.config.entropy_coefficient / len(advantages)
+        return -self.actor.gradient(activations, actions, weights, entropy_weight)
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]

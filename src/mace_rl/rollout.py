@@ -48,33 +48,38 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     """Play one episode by stepping the environment; see `Episode`."""
     env, space = environment.env, environment.action_space
     discrete = isinstance(space, gymnasium.spaces.Discrete)
-    observations, actions, log_probs, rewards = [], [], [], []
+    observations = np.empty((len(noise) + 1, environment.observation_size), np.float32)
+    actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
+    log_probs = np.empty(len(noise), np.float32)
+    rewards = np.empty(len(noise))
     observation, _ = env.reset()
-    observations.append(environment.encode(observation))
-    require_finite("the observation", observations[0], " after the reset")
+    vector = observations[0]
+    vector[:] = environment.encode(observation)
+    require_finite("the observation", vector, " after the reset")
     terminated = truncated = False
+    t = 0
     while not (terminated or truncated):
-        step = len(rewards)
         if discrete:
-            action, log_prob = compiled.act_discrete(observations[step], *policy[:5], noise[step])
+            action, log_prob = compiled.act_discrete(vector, *policy[:5], noise[t])
             env_action = action + int(space.start)
         else:
-            action, log_prob = compiled.act_box(observations[step], *policy, noise[step])
-            env_action = np.clip(action, space.low, space.high)
+            action, log_prob = compiled.act_box(vector, *policy, noise[t])
+            env_action = action.clip(space.low, space.high)
         observation, reward, terminated, truncated, _ = env.step(env_action)
-        vector = environment.encode(observation)
-        if not (math.isfinite(reward) and math.isfinite(vector.sum())):
-            require_finite("the reward", reward, f" after step {step + 1}")
-            require_finite("the observation", vector, f" after step {step + 1}")
-        observations.append(vector)
-        actions.append(action)
-        log_probs.append(log_prob)
-        rewards.append(float(reward))
+        actions[t], log_probs[t], rewards[t] = action, log_prob, reward
+        t += 1
+        vector = observations[t]
+        vector[:] = environment.encode(observation)
+        # A sum of squares has no NaN or Inf to hide behind, and is the cheapest to take.
+        if not (math.isfinite(reward) and math.isfinite(vector.dot(vector))):
+            require_finite("the reward", reward, f" after step {t}")
+            require_finite("the observation", vector, f" after step {t}")
+    # Copies: an episode that ended early should not hold the memory of a whole one.
     return Episode(
-        observations=np.stack(observations),
-        actions=np.array(actions, np.int64) if discrete else np.stack(actions),
-        log_probs=np.array(log_probs, np.float32),
-        rewards=np.array(rewards),
+        observations=observations[: t + 1].copy(),
+        actions=actions[:t].copy(),
+        log_probs=log_probs[:t].copy(),
+        rewards=rewards[:t].copy(),
         terminated=bool(terminated),
     )
 

@@ -5,7 +5,6 @@ from streams of their own.
 """
 
 import numpy as np
-import torch
 
 # Order matters: a stream's place is its key. New streams go at the end.
 STREAMS = (
@@ -29,10 +28,3 @@ def sequence(seed: int, stream: str) -> np.random.SeedSequence:
 def numpy_generator(seed: int, stream: str) -> np.random.Generator:
     """A NumPy generator for `stream`."""
     return np.random.default_rng(sequence(seed, stream))
-
-
-def torch_generator(seed: int, stream: str) -> torch.Generator:
-    """A PyTorch generator for `stream`; used for initial weights only."""
-    generator = torch.Generator()
-    generator.manual_seed(int(sequence(seed, stream).generate_state(1, np.uint64)[0] >> 1))
-    return generator

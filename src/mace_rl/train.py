@@ -98,7 +98,7 @@ class Trainer:
         return rollout
 
     def appraise(self, episode: Episode) -> Experience:
-        """Curiosity bonus, advantages and β of a finished episode; then β for the next."""
+        """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
         observations = self.ppo.normalise(episode.observations)
         beta, bonus = 0.0, np.zeros(len(episode))
         intrinsic = bonus, bonus
@@ -107,6 +107,7 @@ class Trainer:
         )
         if self.curiosity and self.controller:
             beta = self.controller.beta
+            require_finite("β", beta)
             bonus = self.curiosity.bonus(episode)
             require_finite("the curiosity bonus", bonus)
             intrinsic = self.ppo.advantages_and_returns(
@@ -114,7 +115,6 @@ class Trainer:
             )
             self.curiosity.remember(episode, extrinsic[1])
             self.controller.next_episode(episode, bonus)
-            require_finite("β", self.controller.beta)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
             Record(
