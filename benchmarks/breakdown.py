@@ -35,6 +35,7 @@ METHODS = (
     ("critics' values, advantages", "ppo", "advantages_and_returns"),
     ("update: actor", "ppo", "actor_gradient"),
     ("update: actor", "ppo.learners.actor", "descend"),
+    ("update: critics", "ppo", "critic_gradient"),
     ("update: critics", "ppo.learners.extrinsic", "descend"),
 )
 METHODS_WITH_BONUS = (
@@ -51,7 +52,6 @@ METHODS_WITH_BONUS = (
 FUNCTIONS = (
     ("acting", "train", "draw_noise"),
     ("acting", "compiled", "act_box"),
-    ("update: critics", "ppo", "value_gradient"),
     ("memory", "curiosity", "relevance"),
 )
 

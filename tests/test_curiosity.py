@@ -4,18 +4,16 @@ import copy
 
 import numpy as np
 import pytest
-import torch
 
 from mace_rl.curiosity import Curiosity, relevance
 from mace_rl.environments import Environment
-from mace_rl.memory import Recollection
 from mace_rl.rollout import Episode
 
-RETURNS = torch.tensor([-20.0, -10.0, 0.0, 10.0, 20.0])  # mean 0, standard deviation √200
+RETURNS = np.float32([-20, -10, 0, 10, 20])  # mean 0, standard deviation √200
 
 
-def recollection(similarity: float, value: float) -> Recollection:
-    return Recollection(torch.tensor([[0.0, 0.0, value]]), torch.tensor([similarity]))
+def relevance_of(similarity: float, value: float, returns: np.ndarray = RETURNS) -> float:
+    return float(relevance(np.float32([similarity]), np.float32([value]), returns)[0])
 
 
 def episode_of(states, rewards=None, terminated=True) -> Episode:
@@ -54,44 +52,44 @@ def make(run_config):
 
 @pytest.mark.parametrize("value", [-1000.0, -20.0, 0.0, 20.0, 1000.0])
 def test_nothing_similar_is_fully_relevant(value):
-    assert float(relevance(recollection(0.0, value), RETURNS)) == 1
+    assert relevance_of(0.0, value) == 1
 
 
 def test_similar_and_unproductive_goes_to_0():
-    values = [float(relevance(recollection(1.0, v), RETURNS)) for v in (0, -20, -40, -100)]
+    values = [relevance_of(1.0, v) for v in (0, -20, -40, -100)]
     assert values[0] == pytest.approx(0.5)
     assert values == sorted(values, reverse=True)
     assert values[1] < 0.2 and values[3] < 0.001
 
 
 def test_similar_and_productive_stays_near_1():
-    values = [float(relevance(recollection(1.0, v), RETURNS)) for v in (0, 20, 40, 100)]
+    values = [relevance_of(1.0, v) for v in (0, 20, 40, 100)]
     assert values == sorted(values) and values[1] > 0.8 and values[3] > 0.999
 
 
 def test_relevance_by_hand():
     # (10 − 0) / √200 = 0.7071; the logistic function of it is 0.66976; 1 − ½ (1 − 0.66976).
-    found = relevance(recollection(0.5, 10.0), RETURNS)
-    assert float(found) == pytest.approx(0.83488, abs=1e-5)
+    found = relevance_of(0.5, 10.0)
+    assert found == pytest.approx(0.83488, abs=1e-5)
 
 
 def test_relevance_does_not_depend_on_the_unit_of_reward():
-    found = relevance(recollection(0.7, -7.0), RETURNS)
-    other = relevance(recollection(0.7, -0.07 + 5), RETURNS / 100 + 5)
-    assert float(found) == pytest.approx(float(other), abs=1e-4)
+    found = relevance_of(0.7, -7.0)
+    other = relevance_of(0.7, -0.07 + 5, RETURNS / 100 + 5)
+    assert found == pytest.approx(other, abs=1e-4)
 
 
 def test_relevance_is_within_0_and_1_even_if_all_returns_are_equal():
-    for returns in (torch.zeros(5), torch.full((1,), 3.0), RETURNS):
+    for returns in (np.zeros(5, np.float32), np.float32([3]), RETURNS):
         for similarity in (0.0, 0.3, 1.0):
             for value in (-1e6, 0.0, 3.0, 1e6):
-                assert 0 <= float(relevance(recollection(similarity, value), returns)) <= 1
+                assert 0 <= relevance_of(similarity, value, returns) <= 1
 
 
 def test_relevance_is_in_the_middle_if_all_returns_are_equal_up_to_rounding():
-    returns = torch.full((1000,), 100.0)
+    returns = np.full(1000, 100, np.float32)
     for value in (100.0, np.nextafter(np.float32(100), np.float32(200))):
-        assert float(relevance(recollection(1.0, value), returns)) == pytest.approx(0.5, abs=0.1)
+        assert relevance_of(1.0, value, returns) == pytest.approx(0.5, abs=0.1)
 
 
 # --- The bonus ----------------------------------------------------------------------------------

@@ -169,6 +169,7 @@ def test_same_bits_away_from_the_plane(pair) -> None:
 def test_towards_target_whatever_the_signs_of_zero() -> None:
     special = [0.0, -0.0, 1.5, -2.7, np.inf, np.nan]
     angles = [0.0, -0.0, np.pi, -0.3]
+    shortcuts = 0
     for dx, dy, yaw in itertools.product([999.7, -3.1], [0.0, -0.0, 0.1], angles):
         theta = np.arctan2(dy, dx)
         turn = np.array(
@@ -179,10 +180,14 @@ def test_towards_target_whatever_the_signs_of_zero() -> None:
         for speed in itertools.product(special, repeat=3):
             with np.errstate(invalid="ignore"):
                 expected = np.array([*place, *np.dot(turn, np.array(speed))])
-                found = np.array(hopper.towards_target(dx, dy, yaw, *speed))
-            np.testing.assert_array_equal(found, expected)
+                results = [hopper.towards_target(dx, dy, yaw, *speed)]
+            holds, short = hopper.in_plane(dx, dy, yaw, *speed)
+            shortcuts += holds
             zero = expected == 0
-            np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
+            for found in map(np.array, [*results, short] if holds else results):
+                np.testing.assert_array_equal(found, expected)
+                np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
+    assert shortcuts
 
 
 @pytest.mark.parametrize("speed", [1e3, -1e6, np.nan])
@@ -306,7 +311,7 @@ def test_falls_back_with_a_render_mode() -> None:
 
 def test_another_order_of_addition_is_noticed(monkeypatch) -> None:
     assert hopper.numpy_adds_as_assumed.__wrapped__()
-    monkeypatch.setattr(hopper, "mean_of_11", lambda v: sum(v) / 11)
+    monkeypatch.setattr(hopper, "mean_of_11", lambda v: sum(v.tolist()) / 11)
     assert not hopper.numpy_adds_as_assumed.__wrapped__()
 
 

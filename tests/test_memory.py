@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mace_rl.hyperparameters import MemoryConfig
-from mace_rl.memory import EpisodicMemory
+from mace_rl.memory import EpisodicMemory, Recollection
 from mace_rl.nearest import nearest
 
 ORIGIN, UNIT = torch.zeros(3), torch.ones(3)  # the identity as an embedding
@@ -36,26 +36,67 @@ def test_nearest_equals_a_full_sort(size, total, count):
     rng = np.random.default_rng(0)
     queries = rng.standard_normal((25, size)).astype(np.float32)
     points = rng.standard_normal((total, size)).astype(np.float32)
-    squares, indices = nearest(queries, points, count)
-    exact = ((queries[:, None].astype(np.float64) - points[None]) ** 2).sum(2)
+    mean, std = rng.standard_normal(size).astype(np.float32), np.float32([0.5, 2, 1] * 5)[:size]
+    squares, indices = nearest(queries, points, mean, std, count)
+    exact = (((queries[:, None].astype(np.float64) - points[None]) / std) ** 2).sum(2)
     expected = np.sort(exact, axis=1)[:, :count]
-    np.testing.assert_allclose(squares, expected, rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(squares, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(np.take_along_axis(exact, indices, 1), expected, rtol=1e-5)
     assert all(len(set(row)) == count for row in indices.tolist())
 
 
 def test_nearest_of_equally_distant_points_are_the_first():
     points = np.array([[2], [1], [3], [1], [0], [1], [2]], np.float32)
-    squares, indices = nearest(np.array([[1], [2.5]], np.float32), points, 5)
+    identity = np.zeros(1, np.float32), np.ones(1, np.float32)
+    squares, indices = nearest(np.array([[1], [2.5]], np.float32), points, *identity, 5)
     assert indices.tolist() == [[1, 3, 5, 0, 4], [0, 2, 6, 1, 3]]
     assert squares.tolist() == [[0, 0, 0, 1, 1], [0.25, 0.25, 0.25, 2.25, 2.25]]
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(st.data())
+def test_nearest_equals_a_stable_sort_whatever_the_order_and_the_ties(data):
+    """To the bit: differences of small integers are exact. Sorted points come nearest last."""
+    size, total = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 200))
+    count = data.draw(st.integers(1, total))
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    points = rng.integers(-3, 4, (total, size)).astype(np.float32)
+    if data.draw(st.booleans()):
+        points = np.sort(points, axis=0)
+    queries = rng.integers(-3, 4, (4, size)).astype(np.float32)
+    identity = np.zeros(size, np.float32), np.ones(size, np.float32)
+    squares, indices = nearest(queries, points, *identity, count)
+    exact = np.square(queries[:, None] - points).sum(2)
+    expected = np.argsort(exact, axis=1, kind="stable")[:, :count]
+    assert (indices == expected).all()
+    assert (squares == np.take_along_axis(exact, expected, 1)).all()
+
+
+def test_distances_far_from_the_origin_keep_their_digits():
+    """Positions like 1000 ± 0.01: the mean goes before the scale."""
+    rng = np.random.default_rng(0)
+    states = (1000 + 0.01 * rng.standard_normal((300, 2))).astype(np.float32)
+    mean, std = states.mean(0, dtype=np.float64), states.std(0, dtype=np.float64)
+    embedding = mean.astype(np.float32), std.astype(np.float32)
+    squares, _ = nearest(states[:20], states[20:], *embedding, 3)
+    exact = (((states[:20, None].astype(np.float64) - states[20:]) / std) ** 2).sum(2)
+    np.testing.assert_allclose(squares, np.sort(exact, axis=1)[:, :3], rtol=1e-5)
+
+
+def test_a_query_that_is_not_a_number_is_at_no_distance():
+    points = np.zeros((30, 2), np.float32)
+    identity = np.zeros(2, np.float32), np.ones(2, np.float32)
+    squares, indices = nearest(np.array([[np.nan, 0], [0, 0]], np.float32), points, *identity, 5)
+    assert np.isnan(squares[0]).all() and (squares[1] == 0).all()
+    assert ((indices >= 0) & (indices < 30)).all()
 
 
 # --- Lookup -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stored", [1, 3, 40])
-def test_lookup_equals_a_loop_over_all_entries(stored):
+@pytest.mark.parametrize("differentiable", [False, True])
+def test_lookup_equals_a_loop_over_all_entries(stored, differentiable):
     """Pritzel et al. 2017, eqs. 2 and 5, one query at a time in double precision."""
     memory = make_memory(neighbours=4)
     keys, next_states, rewards, returns = experiences(stored)
@@ -63,7 +104,8 @@ def test_lookup_equals_a_loop_over_all_entries(stored):
     generator = torch.Generator().manual_seed(9)
     queries = torch.randn((12, 3), generator=generator)
     mean, std = torch.randn(3, generator=generator), torch.rand(3, generator=generator) + 0.5
-    found = memory.lookup(queries, mean, std)
+    found = memory.lookup(queries.clone().requires_grad_(differentiable), mean, std)
+    found = Recollection(*(part.detach() for part in found))
     for n, query in enumerate(queries.double()):
         entries = []
         for i in range(stored):

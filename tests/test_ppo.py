@@ -167,13 +167,18 @@ def test_actor_gradient_is_that_of_the_clipped_surrogate(
     cases = torch.stack([ratio > 1.2, ratio < 0.8, advantage > 0], dim=1).unique(dim=0)
     assert len(cases) == 6
     np.testing.assert_allclose(ppo.actor_gradient(batch), expected, rtol=1e-3, atol=1e-5)
-    part = np.array([3, 1, 7])
-    minibatch = Batch(
-        *(getattr(batch, name)[part] for name in ("observations", "actions", "log_probs")),
-        advantages=batch.advantages[part],
-        returns={},
-    )
-    assert (ppo.actor_gradient(batch, part) == ppo.actor_gradient(minibatch)).all()
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_gradients_are_means_over_all_steps_of_a_large_batch(make_ppo, monkeypatch, environment):
+    """Of what each step alone gives: blocks, also an incomplete last one, leave no trace."""
+    ppo = make_ppo(environment)
+    batch = random_batch(ppo, count=20)
+    for gradient in (ppo.actor_gradient, lambda part: ppo.critic_gradient("extrinsic", part)):
+        expected = np.mean([gradient(batch[t : t + 1]) for t in range(20)], axis=0)
+        for block in (1, 7, 20, 512):
+            monkeypatch.setattr("mace_rl.ppo.BLOCK", block)
+            np.testing.assert_allclose(gradient(batch), expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -324,6 +324,14 @@ def test_observations_are_copied(register):
     assert observations[:, 0].tolist() == [0, 1, 2, 3]
 
 
+def test_a_short_episode_holds_no_more_memory_than_its_own(register):
+    environment = Environment(register("Corridor-v0", Corridor, 1000, length=4), 0)
+    noise = draw_noise(environment, np.random.default_rng(0))
+    episode = roll_out(environment, uniform_policy(environment), noise)
+    for array in (episode.observations, episode.actions, episode.log_probs, episode.rewards):
+        assert array.base is None and len(array) <= 5
+
+
 # --- Environments -------------------------------------------------------------------------------
 
 

@@ -1,5 +1,6 @@
 """One run on disk: interrupted and resumed to the bit, what it refuses, what it leaves behind."""
 
+import ast
 import fcntl
 import hashlib
 import json
@@ -175,6 +176,40 @@ def test_a_process_killed_by_sigkill_is_resumed_by_another(
     run.run(config, tmp_path / "whole")
     assert outcome(directory) == outcome(tmp_path / "whole")
     assert len(provenance_of(directory)["interruptions"]) == 1
+
+
+COUNT_THREADS = """
+import sys
+from pathlib import Path
+from threadpoolctl import threadpool_info
+from mace_rl import run
+from mace_rl.hyperparameters import RunConfig
+from mace_rl.train import Trainer
+
+class Watched(Trainer):
+    def run(self):
+        yield from super().run()
+        print({library["filepath"]: library["num_threads"] for library in threadpool_info()})
+
+run.Trainer = Watched
+run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+def test_a_run_uses_one_thread(run_config, tmp_path):
+    """Whatever the environment says, and in every library, NumPy's BLAS and SciPy's among them."""
+    config = run_config("CartPole-v1", "mace_full", 0, episodes=3)
+    done = subprocess.run(
+        [sys.executable, "-c", COUNT_THREADS, config.model_dump_json(), str(tmp_path)],
+        env={name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    threads = ast.literal_eval(done.stdout)
+    assert any("scipy" in Path(library).parent.name for library in threads)
+    assert any("numpy" in Path(library).parent.name for library in threads)
+    assert set(threads.values()) == {1}
 
 
 def test_a_dying_predecessor_is_waited_for(tmp_path):

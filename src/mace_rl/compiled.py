@@ -13,6 +13,7 @@ in this one file because numba's on-disk cache does not notice changes in other 
 import math
 
 import numpy as np
+import scipy.linalg.cython_blas  # noqa: F401  (np.dot's, loaded before threads are limited)
 from numba import njit
 
 CARTPOLE, ACROBOT = 0, 1
@@ -191,7 +192,7 @@ def gaussian_slopes(means, log_std, actions, weights, entropy_weight):
 
 @kernel
 def surrogate_weights(log_probs, old_log_probs, advantages, clip):
-    """What the gradient of PPO's mean clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
+    """What the gradient of PPO's clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
 
     The surrogate min(rA, clip(r)A), with ratio r, is flat where the ratio is already past the bound
     that the advantage pushes it to; elsewhere its gradient is r A ∇ log π.
@@ -201,7 +202,7 @@ def surrogate_weights(log_probs, old_log_probs, advantages, clip):
         ratio, advantage = math.exp(log_probs[n] - old_log_probs[n]), advantages[n]
         flat = ratio > 1 + clip if advantage > 0 else ratio < 1 - clip
         if not flat:
-            weights[n] = ratio * advantage / len(weights)
+            weights[n] = ratio * advantage
     return weights
 
 

@@ -4,28 +4,29 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from numba import njit
 
 from mace_rl.environments import Environment
 from mace_rl.hyperparameters import RunConfig
-from mace_rl.memory import EpisodicMemory, Recollection
+from mace_rl.memory import EpisodicMemory
 from mace_rl.novelty import CountNovelty, DensityNovelty, Novelty
 from mace_rl.rollout import Episode
 from mace_rl.standardise import RunningStandardiser
 
 
-def relevance(recollection: Recollection, returns: Tensor) -> Tensor:
-    """Memory relevance in [0, 1], [N]: 1 - similarity · (1 - productivity).
+@njit(cache=True)
+def relevance(similarity, recalled, returns):
+    """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
 
-    Productivity is where the remembered return-to-go lies among all `returns` in memory, [M]: the
-    logistic function of its distance from their mean in standard deviations. So a state unlike
-    anything remembered has relevance 1, one like unproductive states goes toward 0, and one like
-    productive states stays near 1.
+    similarity: [N]; recalled: remembered return-to-go, [N]. Productivity is where it lies among all
+    `returns` in memory, [M]: the logistic function of its distance from their mean in standard
+    deviations. So a state unlike anything remembered has relevance 1, one like unproductive states
+    goes toward 0, and one like productive states stays near 1.
     """
+    mean = returns.astype(np.float64).mean()
     # Not below float32's rounding, which would decide if all returns were equal.
-    spread = returns.std(correction=0) + 1e-6 * returns.abs().mean() + 1e-8
-    productivity = torch.sigmoid((recollection.values[:, -1] - returns.mean()) / spread)
-    return 1 - recollection.similarity * (1 - productivity)
+    spread = np.sqrt(np.square(returns - mean).mean()) + 1e-6 * np.abs(returns).mean() + 1e-8
+    return 1 - similarity * (1 - 1 / (1 + np.exp((mean - recalled) / spread)))
 
 
 class Curiosity:
@@ -53,13 +54,15 @@ class Curiosity:
         novelty = self.novelty(states)
         if len(self.memory) == 0:
             return novelty
-        with torch.no_grad():
-            recollection = self.memory.lookup(
-                torch.from_numpy(states),
-                torch.from_numpy(self.embedding.mean.astype(np.float32)),
-                torch.from_numpy(self.scale().astype(np.float32)),
-            )
-            return novelty * relevance(recollection, self.memory.returns).double().numpy()
+        recollection = self.memory.lookup(
+            torch.from_numpy(states),
+            torch.from_numpy(self.embedding.mean.astype(np.float32)),
+            torch.from_numpy(self.scale().astype(np.float32)),
+        )
+        similarity, recalled = recollection.similarity, recollection.values[:, -1]
+        return novelty * relevance(
+            similarity.numpy(), recalled.numpy(), self.memory.returns.numpy()
+        )
 
     def scale(self) -> np.ndarray:
         """The unit of distance between states, [observation].

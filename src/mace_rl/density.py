@@ -30,37 +30,48 @@ class MADE(MLP):
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, [N, size] → [N]."""
-        mean, log_std = self._moments(self.forward(x))
-        deviations = (x - mean) * np.exp(-log_std)
-        constant = np.float32(0.5 * math.log(2 * math.pi))
-        return (-0.5 * deviations * deviations - log_std - constant).sum(axis=1)
+        *_, outputs = self.forward(x)
+        return gaussian_log_probs(x, outputs, self._inverse_std(outputs))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """∇ of the mean log-density of the rows of x, [N, size], with respect to `parameters`."""
         activations = self.forward(x)
-        mean, log_std = self._moments(activations)
-        slope = gaussian_slope(activations[0], mean, log_std, np.exp(-log_std))
+        outputs = activations[-1]
+        slope = gaussian_slope(x, outputs, self._inverse_std(outputs))
         return self.backward(activations, slope) * self.mask
 
-    def _moments(self, activations: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """μ and log σ, [N, size] each, from what `forward` returned."""
-        mean, log_std = np.split(activations[-1], 2, axis=1)
-        return mean, np.maximum(log_std, np.float32(SMALLEST_LOG_STD))
+    def _inverse_std(self, outputs: np.ndarray) -> np.ndarray:
+        """1 / σ, [N, size], from the network's outputs, [N, 2 size]: μ, then log σ unbounded."""
+        log_std = outputs[:, outputs.shape[1] // 2 :]
+        return np.exp(-np.maximum(log_std, np.float32(SMALLEST_LOG_STD)))
 
 
 @njit(cache=True, error_model="numpy")
-def gaussian_slope(x, mean, log_std, inverse_std):
-    """Gradient of the mean of log N(x; μ, σ) with respect to μ and log σ, [N, 2 size].
+def gaussian_log_probs(x, outputs, inverse_std):
+    """Σ_i log N(x_i; μ_i, σ_i) of each row, [N]; arguments as in `gaussian_slope`."""
+    count, size = x.shape
+    result = np.full(count, -0.5 * math.log(2 * math.pi) * size, x.dtype)
+    for n in range(count):
+        for i in range(size):
+            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
+            log_std = max(outputs[n, size + i], SMALLEST_LOG_STD)
+            result[n] -= 0.5 * deviation * deviation + log_std
+    return result
 
-    All arguments are [N, size]; log σ at its lower bound has no gradient.
+
+@njit(cache=True, error_model="numpy")
+def gaussian_slope(x, outputs, inverse_std):
+    """Gradient of the mean over the rows of Σ_i log N(x_i; μ_i, σ_i) at the outputs, [N, 2 size].
+
+    x: [N, size]; outputs: [N, 2 size], μ and log σ, which has no gradient below its lower bound;
+    inverse_std: [N, size], 1 / σ.
     """
     count, size = x.shape
-    slope = np.empty((count, 2 * size), x.dtype)
+    slope = np.empty_like(outputs)
     for n in range(count):
-        mean_slope, log_std_slope = slope[n, :size], slope[n, size:]
         for i in range(size):
-            deviation = (x[n, i] - mean[n, i]) * inverse_std[n, i]
-            mean_slope[i] = deviation * inverse_std[n, i] / count
-            free = log_std[n, i] > SMALLEST_LOG_STD
-            log_std_slope[i] = (deviation * deviation - 1) / count if free else 0.0
+            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
+            slope[n, i] = deviation * inverse_std[n, i] / count
+            free = outputs[n, size + i] > SMALLEST_LOG_STD
+            slope[n, size + i] = (deviation * deviation - 1) / count if free else 0.0
     return slope

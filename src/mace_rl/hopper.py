@@ -2,20 +2,21 @@
 
 The library calls the simulator some 25 times a step, for one number or joint at a time, through a
 wrapper that builds a `functools.partial` each time; here a step is six calls. The rest is
-arithmetic on 15 numbers, for which plain floats are quicker than arrays: a Python float is the
-double that numpy uses, and +, -, *, / give the same bits as long as their order is the library's.
-Where numpy or BLAS chooses the instructions (sin, cos, arctan2, dot), either the result is exact
-whatever the instructions, or the same numpy function is called.
+arithmetic on some 40 numbers, and compiled: +, -, *, / give numpy's bits as long as their order is
+the library's and no option, such as numba's `fastmath`, lets the compiler change it. Where numpy or
+BLAS chooses the instructions (sin, cos, arctan2, dot), either the result is exact whatever the
+instructions, or the same numpy function is called.
 """
 
 import math
-from collections.abc import Sequence
+import struct
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 import pybullet
+from numba import njit
 from numpy.typing import NDArray
 from pybullet_envs_gymnasium.gym_locomotion_envs import HopperBulletEnv
 from pybullet_envs_gymnasium.robot_locomotors import Hopper
@@ -28,10 +29,13 @@ PARTS |= {"thigh": 5, "link0_8": 6, "leg": 7, "link0_10": 8, "foot": 9}
 LINKS = list(PARTS.values())
 JOINTS = {"thigh_joint": 4, "leg_joint": 6, "foot_joint": 8}
 JOINT_NUMBERS = list(JOINTS.values())
-AT_LIMIT = float(np.float32(0.99))  # the library compares float32 with 0.99, rounded to float32
+AT_LIMIT = np.float32(0.99)  # the library compares float32 with 0.99, rounded to float32
+BOUND = np.float32(5.0)  # of every number in the state
+write_raw = struct.Struct("42d").pack_into  # numbers into an array, faster than numpy's assignment
 
 
-def mean_of_11(v: Sequence[float]) -> float:
+@njit(cache=True)
+def mean_of_11(v: NDArray[np.float64]) -> float:
     """`np.mean` of 11 doubles: numpy adds the first eight pairwise, then the rest in order."""
     first8 = ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7]))
     return (first8 + v[8] + v[9] + v[10]) / 11
@@ -46,27 +50,41 @@ def numpy_adds_as_assumed() -> bool:
     rng = np.random.default_rng(0)
     tried = rng.standard_normal((50, 33)) * 10.0 ** rng.integers(-3, 4, (50, 33))
     return all(
-        v[0::3].mean() == mean_of_11(v[0::3].tolist())
+        v[0::3].mean() == mean_of_11(v[0::3].copy())
         and v[:3].astype(np.float32).mean() == sum(v[:3].astype(np.float32)) / 3
         and np.linalg.norm(v[:2].tolist()) == math.sqrt(v[:2].dot(v[:2]))
         for v in tried
     )
 
 
+@njit(cache=True)
 def is_plus_zero(v: float) -> bool:
     """Whether v is 0.0 and not -0.0."""
-    return v == 0.0 < math.copysign(1.0, v)
+    return v == 0.0 and math.copysign(1.0, v) > 0.0
+
+
+# Direction and distance of the target, sin and cos of the angle to it, speed turned by -yaw.
+TowardsTarget = tuple[float, float, float, float, float, float, float]
+
+
+@njit(cache=True)
+def in_plane(
+    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
+) -> tuple[bool, TowardsTarget]:
+    """Whether the hopper moves in the plane y = 0, facing the target; what follows if so.
+
+    Then every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
+    cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. So it is until the hopper has fallen.
+    """
+    facing = yaw == 0.0 and dy == 0.0 and dx > 0.0 and (vx != 0.0 or is_plus_zero(yaw))
+    holds = facing and is_plus_zero(vy) and math.isfinite(vx + vz)
+    return holds, (dy, dx, dy - yaw, 1.0, vx + 0.0, 0.0, vz + 0.0)
 
 
 def towards_target(
     dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """The target's direction and distance, sin and cos of the angle to it, speed turned by -yaw."""
-    in_plane = yaw == dy == 0.0 < dx and is_plus_zero(vy) and math.isfinite(vx + vz)
-    if in_plane and (vx or is_plus_zero(yaw)):
-        # Every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
-        # cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. So it is until the hopper has fallen.
-        return dy, dx, dy - yaw, 1.0, vx + 0.0, 0.0, vz + 0.0
+) -> TowardsTarget:
+    """The same anywhere, as the library has it."""
     theta = np.arctan2(dy, dx)
     target = np.array((dy, dx))
     sin, cos = np.sin(-yaw), np.cos(-yaw)
@@ -74,6 +92,51 @@ def towards_target(
     speed = np.dot(rotation, np.array((vx, vy, vz))).tolist()
     angle = theta - yaw
     return theta, math.sqrt(target.dot(target)), float(np.sin(angle)), float(np.cos(angle)), *speed
+
+
+@njit(cache=True)
+def state_in_plane(raw, ranges, floor_xyz, target_x, target_y, initial_z, feet_contact):
+    """`robot.calc_state` on the condition of `in_plane`, without which state[1:6] is wrong.
+
+    raw: float64 [42], the ten parts' positions [10, 3], the joints' angles and speeds [3, 2], the
+    torso's speed [3], roll, pitch and yaw; ranges: the joints' lowest and highest angles, [3, 2].
+    Returns the state, float32 [15]; the joints' speeds, float32 [3], and how many joints are at
+    their limits; the parts' mean x and y; and whether the condition holds.
+    """
+    xyz, joints = raw[:30].reshape(10, 3), raw[30:36].reshape(3, 2)
+    vx, vy, vz, roll, pitch, yaw = raw[36:]
+    column = np.empty(11)
+    column[:10], column[10] = xyz[:, 0], floor_xyz[0]
+    x = mean_of_11(column)
+    column[:10], column[10] = xyz[:, 1], floor_xyz[1]
+    y = mean_of_11(column)
+    holds, towards = in_plane(target_x - x, target_y - y, yaw, vx, vy, vz)
+
+    state = np.empty(15, np.float32)
+    state[0] = xyz[1, 2] - initial_z
+    state[1], state[2] = towards[2], towards[3]
+    state[3], state[4], state[5] = 0.3 * towards[4], 0.3 * towards[5], 0.3 * towards[6]
+    state[6], state[7] = roll, pitch
+    at_limit = 0
+    for k in range(3):  # each joint's position within its range, from -1 to 1, a tenth of its speed
+        low, high = ranges[k]
+        state[8 + 2 * k] = 2 * (joints[k, 0] - low) / (high - low) - 1.0
+        state[9 + 2 * k] = 0.1 * joints[k, 1]
+        at_limit += abs(state[8 + 2 * k]) > AT_LIMIT
+    state[14] = feet_contact[0]
+    speeds = state[9:14:2].copy()
+    for k in range(15):
+        if abs(state[k]) > BOUND:  # a NaN stays NaN
+            state[k] = math.copysign(BOUND, state[k])
+    return state, speeds, at_limit, x, y, holds
+
+
+@njit(cache=True)
+def effort(action, speeds):
+    """Means of |action · speed| and action², in the precision of `action` [3] (as in numpy)."""
+    (a1, a2, a3), three = action, action.dtype.type(3)
+    power = (abs(a1 * speeds[0]) + abs(a2 * speeds[1]) + abs(a3 * speeds[2])) / three
+    return float(power), float((a1 * a1 + a2 * a2 + a3 * a3) / three)
 
 
 class FastHopperBulletEnv(HopperBulletEnv):
@@ -142,8 +205,9 @@ class FastHopperBulletEnv(HopperBulletEnv):
                 self.fast = not self.fallback_reason
             if self.fast:
                 self._hopper, self._floor = self.robot.objects[0], self.scene.ground_plane_mjcf[0]
-                self._ranges = [(j.lowerLimit, j.upperLimit) for j in self.ordered_joints]
-                self._floor_xyz = tuple(self.parts["floor"].get_position().tolist())  # fixed
+                self._ranges = np.array([(j.lowerLimit, j.upperLimit) for j in self.ordered_joints])
+                self._floor_xyz = self.parts["floor"].get_position()  # fixed
+                self._raw = np.empty(42)
             return result
         robot, client = self.robot, self.physicsClientId
         pybullet.restoreState(self.stateId, physicsClientId=client)
@@ -159,7 +223,7 @@ class FastHopperBulletEnv(HopperBulletEnv):
         pybullet.setJointMotorControlArray(
             self._hopper, JOINT_NUMBERS, mode, off, off, off, gains, gains, client
         )
-        state, _, _ = self._observe()
+        state = self._observe()
         self.potential = -robot.walk_target_dist / self.scene.dt
         return state, {}
 
@@ -182,9 +246,10 @@ class FastHopperBulletEnv(HopperBulletEnv):
         )
         pybullet.stepSimulation(client)
 
-        state, height, finite = self._observe()
-        self._alive = float(robot.alive_bonus(height + float(robot.initial_z), robot.body_rpy[1]))
-        done = self._isDone() or not finite
+        state = self._observe()
+        height = state.item(0) + float(robot.initial_z)
+        self._alive = float(robot.alive_bonus(height, robot.body_rpy[1]))
+        done = self._isDone() or math.isnan(sum(state.tolist()))
 
         potential_old = self.potential
         self.potential = -robot.walk_target_dist / self.scene.dt
@@ -194,12 +259,9 @@ class FastHopperBulletEnv(HopperBulletEnv):
         on_ground = pybullet.getContactPoints(self._hopper, self._floor, foot, -1, client)
         robot.feet_contact[0] = 1.0 if on_ground else 0.0
 
-        # numpy's scalars keep the precision: float32 products and sums if the action is float32.
-        a1, a2, a3 = a[0], a[1], a[2]
-        speed = robot.joint_speeds
-        power = (abs(a1 * speed[0]) + abs(a2 * speed[1]) + abs(a3 * speed[2])) / 3
-        electricity_cost = self.electricity_cost * float(power)
-        electricity_cost += self.stall_torque_cost * float((a1 * a1 + a2 * a2 + a3 * a3) / 3)
+        power, stall = effort(a, robot.joint_speeds)
+        electricity_cost = self.electricity_cost * power
+        electricity_cost += self.stall_torque_cost * stall
         joints_at_limit_cost = float(self.joints_at_limit_cost * robot.joints_at_limit)
 
         self.rewards = [self._alive, progress, electricity_cost, joints_at_limit_cost, 0.0]
@@ -208,40 +270,40 @@ class FastHopperBulletEnv(HopperBulletEnv):
         self.reward += reward
         return state, reward, bool(done), False, {}
 
-    def _observe(self) -> tuple[NDArray[np.float32], float, bool]:
-        """`robot.calc_state`, setting what it sets: the state [15], state[0], no NaN in it."""
+    def _observe(self) -> NDArray[np.float32]:
+        """`robot.calc_state`, setting what it sets; the state [15]."""
         robot, client = self.robot, self.physicsClientId
         links = pybullet.getLinkStates(self._hopper, LINKS, 1, 0, client)  # 1: with velocities
         joints = pybullet.getJointStates(self._hopper, JOINT_NUMBERS, client)
-
-        # The torso. By a slip in `BodyPart.speed`, the library's vy is its turning speed about z.
-        xyz, quaternion, _, _, _, _, (vx, _, vz), (_, _, vy) = links[1]
-        x = mean_of_11([link[0][0] for link in links] + [self._floor_xyz[0]])
-        y = mean_of_11([link[0][1] for link in links] + [self._floor_xyz[1]])
-        z = xyz[2]
-        robot.body_xyz = (x, y, z)
+        xyz, quaternion, _, _, _, _, (vx, _, vz), turning = links[1]  # the torso
         robot.body_real_xyz = np.array(xyz)
-        robot.body_rpy = roll, pitch, yaw = pybullet.getEulerFromQuaternion(quaternion)
+        robot.body_rpy = pybullet.getEulerFromQuaternion(quaternion)
         if robot.initial_z is None:
-            robot.initial_z = np.float64(z)  # numpy's, lest the library's step add in float32
+            robot.initial_z = np.float64(xyz[2])  # numpy's, lest the library's step add in float32
 
-        dx, dy = robot.walk_target_x - x, robot.walk_target_y - y
-        theta, distance, sin, cos, vx, vy, vz = towards_target(dx, dy, yaw, vx, vy, vz)
+        raw = []
+        for link in links:
+            raw += link[0]
+        for joint in joints:
+            raw += joint[:2]
+        # By a slip in `BodyPart.speed`, the library's vy is the torso's turning speed about z.
+        velocity = vx, turning[2], vz
+        write_raw(self._raw, 0, *raw, *velocity, *robot.body_rpy)
+        target_x, target_y = robot.walk_target_x, robot.walk_target_y
+        state, robot.joint_speeds, robot.joints_at_limit, x, y, holds = state_in_plane(
+            self._raw,
+            self._ranges,
+            self._floor_xyz,
+            target_x,
+            target_y,
+            robot.initial_z,
+            robot.feet_contact,
+        )
+        theta, distance = dy, dx = target_y - y, target_x - x
+        if not holds:
+            theta, distance, *rest = towards_target(dx, dy, robot.body_rpy[2], *velocity)
+            scaled = np.array(rest) * (1, 1, 0.3, 0.3, 0.3)
+            state[1:6] = scaled.astype(np.float32).clip(-BOUND, BOUND)
         robot.walk_target_theta, robot.walk_target_dist = theta, distance
-
-        j = []  # each joint's position within its range, from -1 to 1, and a tenth of its speed
-        for (position, speed, _, _), (low, high) in zip(joints, self._ranges, strict=True):
-            j += (2 * (position - low) / (high - low) - 1.0, 0.1 * speed)
-        joint_state = np.array(j, dtype=np.float32)
-        robot.joint_speeds = joint_state[1::2]
-        q1, _, q2, _, q3, _ = joint_state.tolist()
-        robot.joints_at_limit = (abs(q1) > AT_LIMIT) + (abs(q2) > AT_LIMIT) + (abs(q3) > AT_LIMIT)
-
-        more = [z - float(robot.initial_z), sin, cos, 0.3 * vx, 0.3 * vy, 0.3 * vz, roll, pitch]
-        # 5 is a float32, so clipping may come before rounding to float32. A NaN stays NaN.
-        values = [
-            v if -5.0 <= v <= 5.0 else 5.0 if v > 5.0 else max(v, -5.0)
-            for v in more + j + robot.feet_contact.tolist()
-        ]
-        state = np.array(values, dtype=np.float32)
-        return state, state.item(0), math.isfinite(sum(values))
+        robot.body_xyz = (x, y, xyz[2])
+        return state

@@ -2,7 +2,9 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 from mace_rl.hyperparameters import MemoryConfig
@@ -29,17 +31,18 @@ class EpisodicMemory:
         self.config = config
         self.keys = torch.zeros(config.capacity, key_size)
         self.values = torch.zeros(config.capacity, key_size + 2)
-        # For each entry the time of its last reading or writing; 0 for an empty one.
-        self.usage = torch.zeros(config.capacity, dtype=torch.int64)
+        # For each entry the time of its last reading or writing; 0 for an empty one. Of equally
+        # old ones the first is overwritten, so entries fill up in order.
+        self.usage = np.zeros(config.capacity, np.int64)
         self.time = 0
 
     def __len__(self) -> int:
-        return int((self.usage > 0).sum())
+        return int(np.count_nonzero(self.usage))
 
     @property
     def returns(self) -> Tensor:
         """Return-to-go of every remembered state, [len(self)]."""
-        return self.values[self.usage > 0, -1]
+        return self.values[: len(self), -1]
 
     def write(self, keys: Tensor, next_states: Tensor, rewards: Tensor, returns: Tensor) -> None:
         """Store N experiences over the least recently used entries.
@@ -47,12 +50,13 @@ class EpisodicMemory:
         keys, next_states: [N, key]; rewards, returns: [N]. Of more than `capacity` the last ones
         are stored.
         """
-        values = torch.cat([next_states, rewards[:, None], returns[:, None]], dim=1)
-        keys, values = keys[-self.config.capacity :], values[-self.config.capacity :]
         self.time += 1
-        oldest = torch.argsort(self.usage, stable=True)[: len(keys)]
-        self.keys[oldest] = keys.float()
-        self.values[oldest] = values.float()
+        written = [part.numpy()[-self.config.capacity :] for part in (keys, next_states)]
+        outcome = [part.numpy()[-self.config.capacity :] for part in (rewards, returns)]
+        oldest = np.argsort(self.usage, kind="stable")[: len(written[0])]
+        values = self.values.numpy()
+        self.keys.numpy()[oldest], values[oldest, :-2] = written
+        values[oldest, -2], values[oldest, -1] = outcome
         self.usage[oldest] = self.time
 
     def lookup(self, queries: Tensor, mean: Tensor, std: Tensor) -> Recollection:
@@ -63,32 +67,58 @@ class EpisodicMemory:
         on the number of dimensions. Differentiable with respect to queries and values. Every
         entry that is read counts as used now. Raises `LookupError` if nothing is stored.
         """
-        stored = (self.usage > 0).nonzero().squeeze(1)
-        if len(stored) == 0:
+        stored = len(self)
+        if stored == 0:
             raise LookupError("the episodic memory is empty")
-        embedded = (queries - mean) / std
-        keys = (self.keys[stored] - mean) / std
-        neighbours = min(self.config.neighbours, len(stored))
-        places = nearest(
-            embedded.detach().float().numpy(), keys.detach().float().numpy(), neighbours
-        )[1]  # int64 [N, k]; which ones are nearest has no gradient
-        chosen = torch.from_numpy(places)
-        squares = (embedded[:, None] - keys[chosen]).square().mean(-1)  # [N, k]
-        kernel = 1 / (squares + self.config.kernel_bandwidth)
-        weights = kernel / kernel.sum(1, keepdim=True)
-        read = stored[chosen]
+        points = (queries.detach(), self.keys[:stored], mean, std)
+        squares, places = nearest(
+            *(tensor.float().numpy() for tensor in points), min(self.config.neighbours, stored)
+        )
         self.time += 1
-        self.usage[read.ravel()] = self.time
+        self.usage[places] = self.time
+        bandwidth = self.config.kernel_bandwidth
+        if not (queries.requires_grad or self.values.requires_grad):
+            size = queries.shape[1]
+            read = recollect(squares / np.float32(size), places, self.values.numpy(), bandwidth)
+            return Recollection(*(torch.from_numpy(part) for part in read))
+        # The same as autograd can follow it; which entries are nearest has no gradient.
+        chosen = torch.from_numpy(places)  # [N, k]
+        squares = ((queries[:, None] - self.keys[chosen]) / std).square().mean(-1)
+        kernel = 1 / (squares + bandwidth)
+        weights = kernel / kernel.sum(1, keepdim=True)
         return Recollection(
-            values=(weights[..., None] * self.values[read]).sum(1),
-            similarity=self.config.kernel_bandwidth * kernel.max(1).values,
+            values=(weights[..., None] * self.values[chosen]).sum(1),
+            similarity=bandwidth * kernel[:, 0],  # the nearest comes first
         )
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""
-        return {"keys": self.keys, "values": self.values, "usage": self.usage, "time": self.time}
+        usage = torch.from_numpy(self.usage)
+        return {"keys": self.keys, "values": self.values, "usage": usage, "time": self.time}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.keys, self.values = state["keys"].clone(), state["values"].clone()
-        self.usage, self.time = state["usage"].clone(), state["time"]
+        self.usage, self.time = state["usage"].numpy().copy(), state["time"]
+
+
+@njit(cache=True)
+def recollect(squares, places, values, bandwidth):
+    """What `lookup` computes from the nearest entries, without gradients.
+
+    squares: float32 [N, k], ascending; places: int64 [N, k], rows of values, float32 [M, value].
+    Returns float32 [N, value] and [N]. Compiled, as a dozen operations of torch take longer than
+    the search for the entries.
+    """
+    recalled = np.zeros((len(squares), values.shape[1]), np.float32)
+    similarity = np.empty(len(squares), np.float32)
+    for n in range(len(squares)):
+        kernel = 1 / (squares[n] + bandwidth)
+        total = kernel.sum()
+        for i in range(len(kernel)):
+            weight = np.float32(kernel[i] / total)
+            row = values[places[n, i]]
+            for j in range(len(row)):
+                recalled[n, j] += weight * row[j]
+        similarity[n] = bandwidth * kernel[0]
+    return recalled, similarity

@@ -107,15 +107,14 @@ class DensityNovelty:
 
     def knn_novelty(self, states: np.ndarray) -> np.ndarray:
         """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
-        visited = self.embedding(self.visited)
+        visited, embedding = self.visited, self.embedding
         largest = min(max(self.config.neighbours), len(visited))
-        squares, _ = nearest(self.embedding(states), visited, largest)
+        mean, std = embedding.mean.astype(np.float32), embedding.std.astype(np.float32)
+        squares, _ = nearest(states, visited, mean, std, largest)
         distances = np.sqrt(squares / states.shape[1], dtype=np.float64)
-        ensemble = [
-            1 - np.exp(-distances[:, :neighbours].mean(axis=1))
-            for neighbours in self.config.neighbours
-        ]
-        return np.mean(ensemble, axis=0)
+        neighbours = np.minimum(self.config.neighbours, largest)
+        means = distances.cumsum(axis=1)[:, neighbours - 1] / neighbours  # [T, ensemble]
+        return (1 - np.exp(-means)).mean(axis=1)
 
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
@@ -129,9 +128,8 @@ class DensityNovelty:
         self.buffer[places] = chosen
         self.seen += len(chosen)
         visited = self.visited
-        for _ in range(self.config.density_steps):
-            index = self.batches.integers(len(visited), size=self.config.density_batch_size)
-            sample = self.embedding(visited[index])
+        shape = self.config.density_steps, self.config.density_batch_size
+        for sample in self.embedding(visited[self.batches.integers(len(visited), size=shape)]):
             self.learner.descend(-self.density.gradient(sample))
         self.reference = np.sort(self.density.log_prob(sample))
         require_finite("a log-density", self.reference)

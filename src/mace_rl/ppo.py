@@ -1,7 +1,8 @@
 """Proximal Policy Optimization (Schulman et al. 2017) with one critic per kind of reward."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,9 @@ from mace_rl.policy import ActingPolicy, Actor
 from mace_rl.standardise import RunningStandardiser
 from mace_rl.streams import numpy_generator
 
+# Steps that go through a network at once. Arrays for many more would not fit into the processor's
+# cache, and the system takes back their memory after each use: a quarter more time for 2048 steps.
+BLOCK = 512
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 
 
@@ -45,6 +49,19 @@ class Batch:
     log_probs: np.ndarray  # float32 [N], when the actions were taken
     advantages: np.ndarray  # float32 [N], of the total reward, normalised
     returns: dict[str, np.ndarray]  # for each critic the λ-returns it learns, float32 [N]
+
+    def __len__(self) -> int:
+        return len(self.log_probs)
+
+    def __getitem__(self, index: Any) -> "Batch":
+        """Some of the steps."""
+        return Batch(
+            self.observations[index],
+            self.actions[index],
+            self.log_probs[index],
+            self.advantages[index],
+            {kind: returns[index] for kind, returns in self.returns.items()},
+        )
 
 
 class PPO:
@@ -114,30 +131,37 @@ class PPO:
     def update(self, batch: Batch) -> dict[str, float]:
         """K epochs over `batch`; returns the last gradient norms by name."""
         norms: dict[str, float] = {}
-        for index in self._minibatches(len(batch.log_probs)):
-            observations = batch.observations[index]
-            norms["actor"] = self.learners["actor"].descend(self.actor_gradient(batch, index))
-            for kind, returns in batch.returns.items():
-                norms[kind] = self.learners[kind].descend(
-                    value_gradient(self.critics[kind], observations, returns[index])
-                )
+        for minibatch in self._minibatches(batch):
+            norms["actor"] = self.learners["actor"].descend(self.actor_gradient(minibatch))
+            for kind in self.critics:
+                norms[kind] = self.learners[kind].descend(self.critic_gradient(kind, minibatch))
         return norms
 
-    def actor_gradient(self, batch: Batch, index: Any = slice(None)) -> np.ndarray:
-        """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
+    def actor_gradient(self, batch: Batch) -> np.ndarray:
+        """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7)."""
 
-        `index` chooses the steps of a minibatch.
-        """
-        actions, advantages = batch.actions[index], batch.advantages[index]
-        activations = self.actor.forward(batch.observations[index])
-        weights = compiled.surrogate_weights(
-            self.actor.log_probs(activations[-1], actions),
-            batch.log_probs[index],
-            advantages,
-            self.config.clip,
-        )
-        entropy_weight = self.config.entropy_coefficient / len(advantages)
-        return -self.actor.gradient(activations, actions, weights, entropy_weight)
+        def gradient(steps: Batch) -> np.ndarray:
+            activations = self.actor.forward(steps.observations)
+            log_probs = self.actor.log_probs(activations[-1], steps.actions)
+            weights = compiled.surrogate_weights(
+                log_probs, steps.log_probs, steps.advantages, self.config.clip
+            )
+            return self.actor.gradient(
+                activations, steps.actions, weights, self.config.entropy_coefficient
+            )
+
+        return -mean_gradient(gradient, batch)
+
+    def critic_gradient(self, kind: str, batch: Batch) -> np.ndarray:
+        """Gradient of the mean squared error of a critic's V(s) against the λ-returns."""
+        critic = self.critics[kind]
+
+        def gradient(steps: Batch) -> np.ndarray:
+            activations = critic.forward(steps.observations)
+            errors = activations[-1] - steps.returns[kind][:, None]
+            return critic.backward(activations, 2 * errors)
+
+        return mean_gradient(gradient, batch)
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
@@ -151,15 +175,15 @@ class PPO:
             for item in advantages
         ]
 
-    def _minibatches(self, size: int) -> Iterator[Any]:
-        """Indices of each minibatch of each epoch; the whole batch in order if none are asked."""
+    def _minibatches(self, batch: Batch) -> Iterator[Batch]:
+        """Each minibatch of each epoch; the whole batch in order if none are asked for."""
         for _ in range(self.config.epochs):
             if self.config.minibatch_size is None:
-                yield slice(None)
+                yield batch
             else:
-                order = self.minibatches.permutation(size)
-                for start in range(0, size, self.config.minibatch_size):
-                    yield order[start : start + self.config.minibatch_size]
+                order = self.minibatches.permutation(len(batch))
+                for start in range(0, len(batch), self.config.minibatch_size):
+                    yield batch[order[start : start + self.config.minibatch_size]]
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, normaliser and generator."""
@@ -177,8 +201,7 @@ class PPO:
         self.minibatches.bit_generator.state = state["minibatches"]
 
 
-def value_gradient(critic: MLP, observations: np.ndarray, returns: np.ndarray) -> np.ndarray:
-    """Gradient of the mean squared error of V(s) against `returns`, [N]; float32 [n]."""
-    activations = critic.forward(observations)
-    errors = activations[-1] - returns[:, None]
-    return critic.backward(activations, errors * np.float32(2 / len(returns)))
+def mean_gradient(gradient: Callable[[Batch], np.ndarray], batch: Batch) -> np.ndarray:
+    """The mean over a batch of a gradient, [n], that is a sum over its steps."""
+    parts = (gradient(batch[start : start + BLOCK]) for start in range(0, len(batch), BLOCK))
+    return reduce(np.add, parts) / np.float32(len(batch))

@@ -70,8 +70,7 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
         t += 1
         vector = observations[t]
         vector[:] = environment.encode(observation)
-        # A sum of squares has no NaN or Inf to hide behind, and is the cheapest to take.
-        if not (math.isfinite(reward) and math.isfinite(vector.dot(vector))):
+        if not (math.isfinite(reward) and math.isfinite(vector.sum())):
             require_finite("the reward", reward, f" after step {t}")
             require_finite("the observation", vector, f" after step {t}")
     # Copies: an episode that ended early should not hold the memory of a whole one.

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 
 
 class RunningStandardiser:
@@ -19,17 +20,10 @@ class RunningStandardiser:
 
     def update(self, observations: np.ndarray) -> None:
         """Take in `observations`, [N, size]."""
-        batch = np.asarray(observations, np.float64)
-        batch_mean = batch.mean(axis=0)
-        difference = batch_mean - self.mean
-        total = self.count + len(batch)
-        self.mean = self.mean + difference * (len(batch) / total)
-        self.sum_of_squares = (
-            self.sum_of_squares
-            + np.square(batch - batch_mean).sum(axis=0)
-            + np.square(difference) * (self.count * len(batch) / total)
+        self.mean, self.sum_of_squares = updated(
+            observations, self.count, self.mean, self.sum_of_squares
         )
-        self.count = total
+        self.count += len(observations)
 
     @property
     def std(self) -> np.ndarray:
@@ -56,3 +50,24 @@ class RunningStandardiser:
         self.count = state["count"]
         self.mean = state["mean"].numpy().copy()
         self.sum_of_squares = state["sum_of_squares"].numpy().copy()
+
+
+@njit(cache=True)
+def updated(batch, count, mean, sum_of_squares):
+    """Mean and sum of squared deviations, float64 [size], of `count` observations and a `batch`.
+
+    batch: [N, size]. A compiled loop since an episode of 30 steps is less work than NumPy's calls.
+    """
+    mean, sum_of_squares = mean.copy(), sum_of_squares.copy()
+    share = len(batch) / (count + len(batch))
+    for i in range(len(mean)):
+        batch_mean = 0.0
+        for value in batch[:, i]:
+            batch_mean += value
+        batch_mean /= len(batch)
+        for value in batch[:, i]:
+            sum_of_squares[i] += (value - batch_mean) ** 2
+        difference = batch_mean - mean[i]
+        mean[i] += difference * share
+        sum_of_squares[i] += difference**2 * count * share
+    return mean, sum_of_squares

@@ -8,6 +8,7 @@ memory. The phases are methods, named after the paper's terms; what they use is 
 that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta`, `ppo`.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -246,7 +247,8 @@ def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
 
 def normalised(advantages: np.ndarray) -> np.ndarray:
     """Advantages with mean 0 and standard deviation 1, [N]."""
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    centred = advantages - advantages.mean()
+    return centred / (root_mean_square(centred) + 1e-8)
 
 
 def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -254,5 +256,12 @@ def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
 
     What of the change is parallel to the advantages is lost in the normalisation.
     """
-    centred, direction = change - change.mean(), normalised(advantages)
-    return (centred - direction * (direction * centred).mean()) / (advantages.std() + 1e-8)
+    centred, change = advantages - advantages.mean(), change - change.mean()
+    spread = root_mean_square(centred) + 1e-8
+    direction = centred / spread
+    return (change - direction * (direction @ change / len(change))) / spread
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """√(Σ x² / N)."""
+    return math.sqrt(values @ values / len(values))
