@@ -278,3 +278,11 @@ def test_restored_memory_is_the_same_and_apart():
     assert (original.keys == restored.keys).all() and (original.usage == restored.usage).all()
     original.write(*experiences(3, seed=2))
     assert not (original.keys == restored.keys).all()
+
+
+def test_a_state_too_far_away_for_float32_recalls_nan():
+    """Which stops the run; an error from within compiled code would not say where."""
+    memory = make_memory()
+    memory.write(*experiences(10))
+    recollection = memory.lookup(torch.full((1, 3), 1e25), ORIGIN, UNIT)
+    assert recollection.values.isnan().all()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from scipy import stats
+from numba import njit
+from scipy import special, stats
 
 from mace_rl import compiled
 from mace_rl.network import MLP
@@ -145,6 +146,30 @@ def test_gradient_equals_finite_differences():
             values.append(objective())
         actor.parameters[i] = original
         assert found[i] == pytest.approx((values[0] - values[1]) / 2e-5, rel=2e-3, abs=2e-4)
+
+
+@njit(error_model="numpy")
+def over(function, values):
+    """A compiled function of every value, in a loop that becomes vector operations."""
+    result = np.empty_like(values)
+    for i in range(len(values)):
+        result[i] = function(values[i])
+    return result
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_compiled_tanh_and_sigmoid(kind):
+    values = np.concatenate([np.linspace(-12, 12, 10_001), [0.0, 1e-30, 1e30, np.inf, -np.inf]])
+    values = values.astype(kind)
+    exact = np.tanh(values.astype(np.float64))
+    found = over(compiled.tanh, values)
+    assert np.abs(found - exact).max() < 2e-7
+    small = np.abs(values) < 1
+    np.testing.assert_allclose(found[small], exact[small], rtol=4e-7)
+    logistic = special.expit(values.astype(np.float64))
+    assert np.abs(over(compiled.sigmoid, values) - logistic).max() < 2e-7
+    for function in (compiled.tanh, compiled.sigmoid):  # or a run that goes bad is not noticed
+        assert np.isnan(over(function, np.full(17, np.nan, kind))).all()
 
 
 @pytest.mark.parametrize("hidden", [[1], [64, 64], [3, 4, 5]])

@@ -362,19 +362,21 @@ def test_bad_numbers_stop_the_run_and_say_where(run_config, register, where, val
     assert len(finished) == 3
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("place", [0, -1])  # before and after every tanh
 @pytest.mark.parametrize("network", ["actor", "extrinsic", "intrinsic"])
-def test_bad_weights_stop_the_run_and_say_whose(run_config, network):
+def test_bad_weights_stop_the_run_and_say_whose(run_config, network, place, value):
     trainer = Trainer(run_config("CartPole-v1", "mace_fixed", 0, episodes=9))
     update = trainer.ppo.update
 
     def overflowing(batch):
         if len(trainer.records) == 3:
-            trainer.ppo.learners[network].parameters[-1] = np.nan
+            trainer.ppo.learners[network].parameters[place] = value
         return update(batch)
 
     trainer.ppo.update = overflowing
     with pytest.raises(
-        NonFiniteError, match=f"seed 0, the update after episode 3: .*{network}.* is nan"
+        NonFiniteError, match=f"seed 0, the update after episode 3: .*{network}.* is (nan|inf)"
     ):
         for _ in trainer.run():
             pass
@@ -393,18 +395,19 @@ def test_bad_first_observation_stops_the_run(run_config, register):
             pass
 
 
-def test_bad_density_stops_the_run(run_config):
+@pytest.mark.parametrize("place", [0, -1])
+def test_bad_density_stops_the_run(run_config, place):
     trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9))
-    with torch.no_grad():
-        trainer.curiosity.novelty.density.biases[-1][:] = np.nan
+    trainer.curiosity.novelty.density.parameters[place] = np.nan
     with pytest.raises(NonFiniteError, match="seed 0, episode 1: a log-density is nan"):
         for _ in trainer.run():
             pass
 
 
-def test_bad_beta_stops_the_run(run_config):
+@pytest.mark.parametrize("place", [0, -1])
+def test_bad_beta_stops_the_run(run_config, place):
     trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9))
-    trainer.controller.network.readout_bias[:] = np.nan
+    trainer.controller.network.parameters[place] = np.nan
     with pytest.raises(NonFiniteError, match=r"CartPole-v1 mace_full seed 0, episode 2: β is nan"):
         for _ in trainer.run():
             pass

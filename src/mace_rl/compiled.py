@@ -1,9 +1,9 @@
 """The compiled inner loops (numba): networks, acting, classic-control episodes.
 
 Networks of 64 units are too small for a tensor library, whose calls cost more than the work in
-them. Everything here is float32 in a fixed order of operations, so the ordinary rollout, which
-calls `act_discrete` or `act_box` step by step, and the compiled one, which runs the same functions
-inside its loop, take the same actions to the bit.
+them. Acting is float32 in a fixed order of operations, so the ordinary rollout, which calls
+`act_discrete` or `act_box` step by step, and the compiled one, which runs the same functions inside
+its loop, take the same actions to the bit.
 
 A network is a flat vector of parameters, per layer the weights [in, out] row by row, then the
 biases [out], and its sizes, int64 [layers + 1]. All compiled functions that call one another stand
@@ -18,8 +18,9 @@ from numba import njit
 
 CARTPOLE, ACROBOT = 0, 1
 
-# "contract" lets a product and a sum become one instruction; division by zero is Inf, not an error,
-# which would keep loops from becoming vector operations.
+# "contract" lets a product and a sum become one instruction; more than that would lose NaN, by
+# which a run that goes bad is noticed. Division by zero is Inf, not an error, which would keep
+# loops from becoming vector operations.
 kernel = njit(cache=True, fastmath={"contract"}, error_model="numpy")
 
 
@@ -28,7 +29,8 @@ def tanh(x):
     """Hyperbolic tangent of a float32 or float64 to 2e-7, as arithmetic that loops vectorise.
 
     tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction cut off
-    after its seventh term, whose error up to y = 4.6 is 2e-9. From x = 9.2 on all is 1 in float32.
+    after its seventh term: an error of 1e-8, and float32's rounding, by which the result can exceed
+    1. From x = 9.2 on all is 1 in float32. NaN stays NaN: mind the order of arguments below.
     """
     y = x * np.float32(0.5)
     y = min(max(y, np.float32(-4.6)), np.float32(4.6))
@@ -281,7 +283,10 @@ def lstm_gradients(
         slope = np.dot(slopes[t], backward)
     np.dot(sequence.T, slopes, inward_gradient)
     np.dot(outputs[:-1].T, slopes, recurrent_gradient)
-    bias_gradient[:] = slopes.sum(axis=0)
+    bias_gradient[:] = 0
+    for row in slopes:
+        for j in range(len(row)):
+            bias_gradient[j] += row[j]
 
 
 @njit(cache=True)
@@ -294,7 +299,7 @@ def normalise(observation, mean, inverse_std, clip):
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def act_discrete(observation, mean, inverse_std, clip, parameters, sizes, uniform):
     """Sample a categorical action by inverting its distribution function at `uniform` in [0, 1).
 
@@ -424,7 +429,8 @@ def step_acrobot(state, action, two):
 @njit(cache=True)
 def _observe(which, state, observation):
     if which == CARTPOLE:
-        observation[:] = state
+        for i in range(4):
+            observation[i] = state[i]
     else:
         observation[0] = math.cos(state[0])
         observation[1] = math.sin(state[0])

@@ -14,7 +14,7 @@ from mace_rl.rollout import Episode
 from mace_rl.standardise import RunningStandardiser
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def relevance(similarity, recalled, returns):
     """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
 

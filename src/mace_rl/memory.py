@@ -81,7 +81,8 @@ class EpisodicMemory:
             size = queries.shape[1]
             read = recollect(squares / np.float32(size), places, self.values.numpy(), bandwidth)
             return Recollection(*(torch.from_numpy(part) for part in read))
-        # The same as autograd can follow it; which entries are nearest has no gradient.
+        # The same as autograd can follow it, for whoever trains through the memory; the method does
+        # not. Which entries are nearest has no gradient.
         chosen = torch.from_numpy(places)  # [N, k]
         squares = ((queries[:, None] - self.keys[chosen]) / std).square().mean(-1)
         kernel = 1 / (squares + bandwidth)
@@ -102,7 +103,7 @@ class EpisodicMemory:
         self.usage, self.time = state["usage"].numpy().copy(), state["time"]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def recollect(squares, places, values, bandwidth):
     """What `lookup` computes from the nearest entries, without gradients.
 

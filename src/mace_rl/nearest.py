@@ -8,13 +8,13 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nearest(queries, points, mean, std, count):
     """The `count` nearest points to each query, nearest first, in units of `std`.
 
-    queries: float32 [N, size]; points: float32 [M, size], M ≥ count; mean, std: float32 [size].
-    Distances are Euclidean between (x - mean) / std of query and point. `mean` cancels but for
-    rounding, which is least if it is near the points. Returns squared distances, float32
+    queries: float32 [N, size]; points: float32 [M, size], finite, M ≥ count; mean, std: float32
+    [size]. Distances are Euclidean between (x - mean) / std of query and point. `mean` cancels but
+    for rounding, which is least if it is near the points. Returns squared distances, float32
     [N, count], and the points' indices, int64 [N, count]; of equally distant points the first in
     `points` come first.
     """

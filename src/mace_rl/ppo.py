@@ -17,8 +17,9 @@ from mace_rl.policy import ActingPolicy, Actor
 from mace_rl.standardise import RunningStandardiser
 from mace_rl.streams import numpy_generator
 
-# Steps that go through a network at once. Arrays for many more would not fit into the processor's
-# cache, and the system takes back their memory after each use: a quarter more time for 2048 steps.
+# Steps that go through a network at once in an update. Arrays for many more would not fit into the
+# processor's cache, and the system takes back their memory after each use: a quarter more time for
+# 2048 steps.
 BLOCK = 512
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 

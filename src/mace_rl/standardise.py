@@ -52,7 +52,7 @@ class RunningStandardiser:
         self.sum_of_squares = state["sum_of_squares"].numpy().copy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def updated(batch, count, mean, sum_of_squares):
     """Mean and sum of squared deviations, float64 [size], of `count` observations and a `batch`.
 

@@ -5,7 +5,7 @@
 One `Trainer` is one run. Each round plays whole episodes with the current policy, weighs the
 curiosity bonus of each episode with its β, updates the policy by PPO, and lets the episodes become
 memory. The phases are methods, named after the paper's terms; what they use is in the file of
-that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta`, `ppo`.
+that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta` (`meta_network`), `ppo`.
 """
 
 import math
@@ -165,9 +165,11 @@ class Trainer:
                 returns=returns,
             )
         )
-        # NaN or Inf in any epoch spreads to the weights and so to the last epoch's gradient.
         for name, norm in norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
+        # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
+        for name, learner in self.ppo.learners.items():
+            require_finite(f"a weight of the {name}", learner.parameters)
         for item in rollout:
             self.ppo.standardiser.update(item.episode.observations[:-1])
 
