@@ -38,10 +38,10 @@ def speed(summary: pd.DataFrame, folder: Path) -> None:
         median = rows["steps_per_second"]
         whiskers = [median - rows["slowest"], rows["fastest"] - median]
         panel.barh(rows["y"], median, color=colours, xerr=whiskers, ecolor="black", capsize=2)
-        for y, rate, ratio in zip(rows["y"], median, rows["ratio"], strict=True):
-            panel.text(rate * 1.15, y, f"{rate:,.0f}  ({ratio:.1f}×)", va="center", fontsize=8)
+        for y, rate, ratio, end in rows[["y", "steps_per_second", "ratio", "fastest"]].to_numpy():
+            panel.text(end * 1.15, y, f"{rate:,.0f}  ({ratio:.1f}×)", va="center", fontsize=8)
         panel.set(xscale="log", title=environment, xlabel="environment steps per second")
-        panel.set_xlim(median.min() / 2, median.max() * 25)
+        panel.set_xlim(median.min() / 2, median.max() * 50)
         panel.grid(axis="x", alpha=0.3)
         panel.set_axisbelow(True)
     panels[0].set_yticks(range(len(names)), LABELS.values())
