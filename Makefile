@@ -2,58 +2,142 @@
 # Every target sets up .venv first, which is silent and instant when there is nothing to do.
 
 PYTHON ?= python3.11
-export PYTHON
+# How many jobs run at once: a number, or all the machine has.
+CORES ?= all
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
 # Everything is UTF-8, whatever the locale says.
 export PYTHONUTF8 := 1
-unexport PYTHONHOME PYTHONPATH
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_NO_INPUT := 1
+unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET PIP_USER
 
 # A command inside the environment. `python -m` also works where the folder's name has a space.
 IN_VENV := PATH="$$PWD/.venv/bin:$$PATH" .venv/bin/python -m
-SNAKEMAKE := $(IN_VENV) snakemake
+SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test bench verify kill-test lint lock bench-lock audit clean help setup
+.PHONY: all quick test test-quick bench verify kill-test lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
-	@$(SNAKEMAKE) -j2 all
+	@$(SNAKEMAKE) all
 
 quick: setup ## the same at small budgets, to see it work (minutes)
-	@$(SNAKEMAKE) -j2 all --configfile config/reduced.yaml
+	@$(SNAKEMAKE) all --configfile config/reduced.yaml
 
-test: setup ## every test
-	@$(IN_VENV) pytest
+test: setup ## every test, on every core
+	@$(IN_VENV) pytest -n auto --dist loadgroup
+
+test-quick: setup ## the tests that take seconds, for the edit loop
+	@$(IN_VENV) pytest -n auto --dist loadgroup -m "not slow"
 
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
-	@benchmarks/setup.sh
-	@benchmarks/.venv/bin/python -m benchmarks $(if $(filter quick,$(BENCH)),--quick)
+	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
 verify: setup ## repeat a sample of the runs in reference/ and compare to the bit (SAMPLE=3)
-	@.venv/bin/python -m mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
+	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
-	@PATH="$$PWD/.venv/bin:$$PATH" .venv/bin/python tools/kill_test.py
+	@$(IN_VENV) tools.kill_test
 
 lint: setup ## check style and workflow
 	@$(IN_VENV) ruff check .
-	@$(IN_VENV) ruff format --check .
-	@$(IN_VENV) snakefmt --check Snakefile workflow
-	@.venv/bin/python tools/lint_workflow.py
+	$(IN_VENV) ruff format --check .
+	$(IN_VENV) snakefmt --check Snakefile workflow
+	$(IN_VENV) tools.lint_workflow
+
+# --- the environment ------------------------------------------------------------------------------
+
+# Two files in .venv say what it was made from, in their names. The content of the locks counts, not
+# their time stamps; and the folder, because neither an environment nor an editable installation
+# survives being moved or copied. What was interrupted has no such file and is made anew.
+digest = $(shell { pwd; cat $(1); } | sha256sum | head -c 16)
+PACKAGES := .venv/packages-$(call digest,environment.lock environment-cuda.lock)
+PROJECT := .venv/project-$(call digest,pyproject.toml)
+# --no-deps: the locks are complete, and torch's ordinary build must not ask for what is in the
+# second one. With build isolation pip would fetch build tools that nothing pins. --no-compile:
+# Python makes byte code of what is imported, when it is.
+INSTALL := .venv/bin/python -m pip install --no-deps --no-build-isolation --no-compile
 
 setup: ## only create .venv from environment.lock
-	@tools/setup.sh
+	@[ ! -e $(PACKAGES) ] || [ ! -e $(PROJECT) ] || exit 0
+	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || {
+	    echo "This needs Python 3.11, and '$(PYTHON)' is not: install it (Debian, Ubuntu: apt install" \
+	        "python3.11 python3.11-venv) or name one: make PYTHON=/path/to/python3.11" >&2
+	    exit 1
+	}
+	echo "Setting up .venv (once: a minute, or several GB if pip finds no CPU build of torch) ..." >&2
+	flock environment.lock bash -c '$(MAKE) --silent $(PROJECT) >setup.log 2>&1' || {
+	    tail -n 15 setup.log >&2
+	    echo "The set-up failed, as shown; the whole output is in setup.log" >&2
+	    exit 1
+	}
+	rm -f setup.log
+
+$(PACKAGES):
+	@rm -f .venv/packages-* .venv/project-*
+	"$(PYTHON)" -m venv --clear .venv
+	pinned() { sed -n "/^$$1==/,/# via/p" environment.lock; }
+	# First what builds the packages that exist as source only, then torch's CPU build, if pip sees
+	# one: left to itself, pip takes the ordinary build, whose hash an index tells beforehand.
+	$(INSTALL) --require-hashes -r <(pinned setuptools)
+	$(INSTALL) --require-hashes -r <(pinned torch | sed '1s/^torch==[^ ]*/&+cpu/') ||
+	    grep -q 'No matching distribution found for torch' setup.log
+	$(INSTALL) --require-hashes -r environment.lock
+	if grep '^torch .* not installed' <(.venv/bin/python -m pip check); then
+	    $(INSTALL) --require-hashes -r environment-cuda.lock
+	fi
+	touch $@
+
+$(PROJECT): $(PACKAGES)
+	@$(INSTALL) --editable .
+	.venv/bin/python -m pip check # fails if pyproject.toml and environment.lock disagree: make lock
+	touch $@
+
+# A shell function: run a tool of one package in an environment that is removed afterwards.
+define throwaway
+folder=$$(mktemp -d)
+trap 'rm -rf "$$folder"' EXIT
+"$(PYTHON)" -m venv "$$folder"
+"$$folder/bin/python" -m pip install --quiet $(1)
+endef
+
+# The hash of torch's CPU build for Linux x86-64, several GB smaller than the ordinary one, which the
+# resolver cannot see. For another version: pip download --no-deps torch==VERSION && pip hash torch-*
+# where pip is set up to see PyTorch's CPU builds.
+TORCH := torch==2.13.0
+TORCH_CPU_HASH := sha256:6746dbcbeb526eb61330b76b41ff1b4eb848951103a892eeb080dfa2b264667b
 
 lock: ## write environment.lock anew from pyproject.toml (UPGRADE=1: take newer releases)
-	@tools/in_throwaway_venv.sh uv==0.13.8 tools/lock.py $(if $(UPGRADE),--upgrade)
-
-bench-lock: ## write benchmarks/environment.lock anew from benchmarks/requirements.txt
-	@tools/in_throwaway_venv.sh uv==0.13.8 benchmarks/lock.py
+	@$(call throwaway,uv==0.13.8)
+	cat environment.lock environment-cuda.lock >"$$folder/lock"
+	unset $${!UV_@} # the machine's settings must not show in the lock
+	"$$folder/bin/python" -m uv pip compile pyproject.toml --all-extras --python-version=3.11 \
+	    --python-platform=linux --generate-hashes --no-header --no-emit-index-url \
+	    --no-emit-find-links --no-config --quiet $(if $(UPGRADE),--upgrade) -o "$$folder/lock"
+	grep -q $(TORCH_CPU_HASH) "$$folder/lock" ||
+	    sed -i 's/^$(TORCH) .*/&\n    --hash=$(TORCH_CPU_HASH) \\/' "$$folder/lock"
+	grep -q $(TORCH_CPU_HASH) "$$folder/lock" || {
+	    echo "lock: TORCH_CPU_HASH in the Makefile is not of the torch that was resolved" >&2
+	    exit 1
+	}
+	# What only torch's ordinary build requires goes into the second file.
+	for file in environment.lock environment-cuda.lock; do
+	    echo '# Written by `make lock` from pyproject.toml: change that, not this file.' >$$file
+	done
+	awk '/^[^ ]/ { file = /^(cuda-|nvidia-|triton=)/ ? "environment-cuda.lock" : "environment.lock" }
+	    { print >>file }' "$$folder/lock"
 
 audit: ## known vulnerabilities of what the locks pin (asks a vulnerability service)
-	@tools/in_throwaway_venv.sh pip-audit==2.10.1 tools/audit.py
+	@$(call throwaway,pip-audit==2.10.1)
+	"$$folder/bin/python" -m pip_audit --strict --require-hashes --disable-pip \
+	    --progress-spinner=off -r environment.lock -r environment-cuda.lock
 
 clean: ## remove .venv and caches; never results/ or Snakemake's records
-	@rm -rf .venv benchmarks/.venv .venv.lock setup.log build src/*.egg-info .hypothesis .pytest_cache .ruff_cache
-	@find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+	@rm -rf .venv setup.log build src/*.egg-info .hypothesis .pytest_cache .ruff_cache
+	find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

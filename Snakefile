@@ -19,8 +19,9 @@ localrules:
     metrics,
     table1,
     table2,
+    comparisons,
     curves,
-    figure1,
+    figure,
 
 
 rule all:
@@ -30,10 +31,14 @@ rule all:
         f"{RESULTS}/table1.csv",
         f"{RESULTS}/supplement.tex",
         f"{RESULTS}/supplement.csv",
+        f"{RESULTS}/comparisons.csv",
         f"{RESULTS}/table2.tex",
         f"{RESULTS}/figure1.pdf",
         f"{RESULTS}/figure1.png",
         f"{RESULTS}/figure1.csv",
+        f"{RESULTS}/figure2.pdf",
+        f"{RESULTS}/figure2.png",
+        f"{RESULTS}/figure2.csv",
 
 
 include: "workflow/rules/train.smk"

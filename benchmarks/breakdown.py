@@ -1,59 +1,81 @@
 """Where a training's time goes, by section and in µs per step: breakdown.csv.
 
-`python -m benchmarks.breakdown CONTESTANT ENVIRONMENT SEED STEPS` profiles one training.
+The program has no timers of its own: its functions are wrapped here from outside.
 """
 
-import sys
 import time
+from collections import defaultdict
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from benchmarks.process import measured, one_thread, report, write_rows
+from benchmarks.process import in_fresh_process, write_rows
 from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FIRST_SEED, HOPPER, OURS, Scale
-from benchmarks.stopwatch import Stopwatch
-from mace_rl import compiled
+from benchmarks.speed import our_config, warm_up
+from mace_rl.environments import classic_control
 
-# In the order of the stacked bars. What no function below is booked on is bookkeeping.
-SECTIONS = (
-    "environment",
-    "acting",
-    "bookkeeping",
-    "critics' values, advantages",
-    "update: actor",
-    "update: critics",
-    "novelty: k-NN",
-    "novelty: density",
-    "memory",
-    "meta network",
-)
-# (section, what of a Trainer holds the function, its name)
-METHODS = (
-    ("environment", "environment.env", "reset"),
-    ("environment", "environment.env", "step"),
-    ("critics' values, advantages", "ppo", "advantages_and_returns"),
-    ("update: actor", "ppo", "actor_gradient"),
-    ("update: actor", "ppo.learners.actor", "descend"),
-    ("update: critics", "ppo", "critic_gradient"),
-    ("update: critics", "ppo.learners.extrinsic", "descend"),
-)
-METHODS_WITH_BONUS = (
-    ("update: critics", "ppo.learners.intrinsic", "descend"),
-    ("novelty: k-NN", "curiosity.novelty", "knn_novelty"),
-    ("novelty: density", "curiosity.novelty", "density_novelty"),
-    ("novelty: density", "curiosity.novelty", "observe"),
-    ("memory", "curiosity.memory", "lookup"),
-    ("memory", "curiosity.memory", "write"),
-    ("meta network", "controller", "next_episode"),
-    ("meta network", "", "adapt"),
-)
-# (section, module, function)
+# In the order of the stacked bars, each with its functions as they hang on a Trainer. What no
+# function here accounts for is bookkeeping.
+SECTIONS = {
+    "environment": "environment.env.reset environment.env.step",
+    "acting": "",  # see `instrument`
+    "bookkeeping": "",
+    "critics' values, advantages": "ppo.advantages_and_returns",
+    "update: actor": "ppo.actor_gradient ppo.optimisers.actor.step",
+    "update: critics": "ppo.critic_gradient ppo.optimisers.extrinsic.step",
+}
+BONUS = {
+    "update: critics": "ppo.optimisers.intrinsic.step",
+    "novelty: k-NN": "curiosity.novelty.knn_novelty",
+    "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.observe",
+    "memory": "curiosity.memory.lookup curiosity.memory.write",
+    "meta network": "controller.next_episode adapt",
+}
+ALL_SECTIONS = list(SECTIONS | BONUS)
+TIME = "microseconds_per_step"
+# Functions of modules: section, module, name.
 FUNCTIONS = (
-    ("acting", "train", "draw_noise"),
-    ("acting", "compiled", "act_box"),
-    ("memory", "curiosity", "relevance"),
+    ("acting", "mace_rl.train", "draw_noise"),
+    ("acting", "mace_rl.agent.kernels", "act_box"),
+    ("memory", "mace_rl.bonus.curiosity", "relevance"),
 )
+
+
+class Stopwatch:
+    """Seconds by section. Sections nest: the inner one's time is not the outer one's."""
+
+    def __init__(self, section: str) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._sections = [section]  # the innermost last
+        self._since = time.perf_counter()
+
+    def wrap(self, section: str, owner: Any, name: str) -> None:
+        """Replace the function `owner.name` by itself with its time booked on `section`."""
+        function: Callable[..., Any] = getattr(owner, name)
+
+        def timed(*arguments: Any, **keywords: Any) -> Any:
+            self._book()
+            self._sections.append(section)
+            try:
+                return function(*arguments, **keywords)
+            finally:
+                self._book()
+                self._sections.pop()
+
+        setattr(owner, name, timed)
+
+    def stop(self) -> dict[str, float]:
+        """Seconds by section until now."""
+        self._book()
+        return dict(self.seconds)
+
+    def _book(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self._sections[-1]] += now - self._since
+        self._since = now
 
 
 def measure_all(scale: Scale) -> None:
@@ -62,40 +84,19 @@ def measure_all(scale: Scale) -> None:
     for environment in ENVIRONMENTS:
         for contestant in OURS:
             steps = scale.later_steps[environment]
-            found = measured("breakdown", contestant, environment, FIRST_SEED, steps)
-            rows += [
-                {
-                    "env": environment,
-                    "contestant": contestant,
-                    "section": section,
-                    "microseconds_per_step": found.get(section, 0.0),
-                }
-                for section in SECTIONS
-            ]
+            found = in_fresh_process(profile, contestant, environment, FIRST_SEED, steps)
+            identity = {"env": environment, "contestant": contestant}
+            times = [{"section": name, TIME: found.get(name, 0.0)} for name in ALL_SECTIONS]
+            rows += [identity | row for row in times]
             write_rows(scale.data / "breakdown.csv", rows)
             print(f"profile: {environment} {contestant}: {sum(found.values()):.1f} µs a step")
 
 
-def instrument(trainer: Any, watch: Stopwatch) -> None:
-    """Book the work of `trainer` on the sections of `watch`; what it does stays the same."""
-
-    for section, path, name in METHODS + (METHODS_WITH_BONUS if trainer.curiosity else ()):
-        owner = trainer
-        for part in filter(None, path.split(".")):
-            owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
-        watch.wrap(section, owner, name)
-    for section, module, name in FUNCTIONS:
-        watch.wrap(section, sys.modules[f"mace_rl.{module}"], name)
-    if trainer.environment.name != HOPPER:
-        # One compiled loop, of environment and acting; `profile` tells them apart.
-        watch.wrap("acting", trainer, "rollout")
-
-
 def profile(contestant: str, environment: str, seed: int, steps: int) -> dict[str, float]:
     """µs per step by section, over at least `steps` steps from scratch."""
-    from benchmarks.contestants import our_config
     from mace_rl.train import Trainer
 
+    warm_up(contestant, environment, seed)
     trainer = Trainer(our_config(contestant, environment, seed))
     watch = Stopwatch("bookkeeping")
     instrument(trainer, watch)
@@ -110,42 +111,42 @@ def profile(contestant: str, environment: str, seed: int, steps: int) -> dict[st
     return {section: 1e6 * value / done for section, value in seconds.items()}
 
 
+def instrument(trainer: Any, watch: Stopwatch) -> None:
+    """Book the work of `trainer` on the sections of `watch`; what it does stays the same."""
+    for section, functions in [*SECTIONS.items(), *(BONUS.items() if trainer.curiosity else ())]:
+        for function in functions.split():
+            *path, name = function.split(".")
+            owner = trainer
+            for part in path:
+                owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
+            watch.wrap(section, owner, name)
+    for section, module, name in FUNCTIONS:
+        watch.wrap(section, import_module(module), name)
+    if trainer.environment.name != HOPPER:
+        # One compiled loop, of environment and acting; `profile` tells them apart.
+        watch.wrap("acting", trainer, "rollout")
+
+
 def compiled_step_seconds(environment: str) -> float:
     """Duration of one compiled step of CartPole or Acrobot, the environment alone."""
-    which = compiled.CARTPOLE if environment == CARTPOLE else compiled.ACROBOT
+    cartpole = environment == CARTPOLE
     actions = np.random.default_rng(0).integers(2, size=200_000)
-    _steps(which, actions[:10], 2.0)
+    _steps(cartpole, actions[:10], 2.0)
     start = time.perf_counter()
-    _steps(which, actions, 2.0)
+    _steps(cartpole, actions, 2.0)
     return (time.perf_counter() - start) / len(actions)
 
 
 @njit
-def _steps(which, actions, two):
+def _steps(cartpole, actions, two):
     state = np.full(4, 0.01)
-    observation = np.empty(4 if which == compiled.CARTPOLE else 6, np.float32)
+    which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
+    observation = np.empty(4 if cartpole else 6, np.float32)
     for action in actions:
-        if which == compiled.CARTPOLE:
-            _, terminated = compiled.step_cartpole(state, action)
+        if cartpole:
+            _, terminated = classic_control.step_cartpole(state, action)
         else:
-            _, terminated = compiled.step_acrobot(state, action, two)
-        compiled._observe(which, state, observation)
+            _, terminated = classic_control.step_acrobot(state, action, two)
+        classic_control._observe(which, state, observation)
         if terminated:
             state[:] = 0.01
-
-
-def main() -> None:
-    """One profile."""
-    contestant, environment, seed, steps = sys.argv[1:]
-    from benchmarks.contestants import start
-    from benchmarks.settings import WARM_UP_STEPS
-    from benchmarks.speed import read_clock
-
-    one_thread()
-    warm_up = start(contestant, environment, int(seed) + 10**6, WARM_UP_STEPS)
-    read_clock(warm_up, [WARM_UP_STEPS])
-    report(profile(contestant, environment, int(seed), int(steps)))
-
-
-if __name__ == "__main__":
-    main()

@@ -2,11 +2,8 @@
 
 The environments are random walks of fixed length that cost next to nothing, so that every episode
 is the same work and nearly all of it our own.
-
-`python -m benchmarks.growth WALK EPISODES` is one run.
 """
 
-import sys
 import time
 from typing import Any
 
@@ -14,8 +11,9 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from benchmarks.process import measured, memory_mb, one_thread, report, write_rows
+from benchmarks.process import in_fresh_process, memory_mb, write_rows
 from benchmarks.settings import ACROBOT, FIRST_SEED, HOPPER, Scale
+from benchmarks.speed import our_config
 
 # Shaped like Acrobot and like Hopper, with their settings and time limits.
 WALKS = {"AcrobotLikeWalk-v0": ACROBOT, "HopperLikeWalk-v0": HOPPER}
@@ -53,36 +51,28 @@ def register() -> None:
 
 def measure_all(scale: Scale) -> None:
     """Run `mace_full` on both walks and write growth.csv."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for walk in WALKS:
-        rows += [{"env": walk, **row} for row in measured("growth", walk, scale.growth_episodes)]
+        rows += in_fresh_process(measure, walk, scale.growth_episodes)
         write_rows(scale.data / "growth.csv", rows)
         print(f"growth: {walk}: {rows[-1]['cpu_seconds']:.0f} s, {rows[-1]['memory_mb']:.0f} MB")
 
 
-def main() -> None:
-    """One run."""
-    walk, episodes = sys.argv[1:]
-    from benchmarks.contestants import our_config
+def measure(walk: str, episodes: int) -> list[dict[str, Any]]:
+    """Time and memory after each episode of one run."""
     from mace_rl.train import Trainer
 
-    one_thread()
     register()
     config = our_config("mace_full", WALKS[walk], FIRST_SEED)
-    trainer = Trainer(config.model_copy(update={"environment": walk, "episodes": int(episodes)}))
-    rows = []
+    trainer = Trainer(config.model_copy(update={"environment": walk, "episodes": episodes}))
     start = time.process_time()
-    for records in trainer.run():
-        rows.append(
-            {
-                "episode": records[-1].episode,
-                "env_steps": records[-1].env_steps,
-                "cpu_seconds": time.process_time() - start,
-                "memory_mb": memory_mb("VmRSS"),
-            }
-        )
-    report(rows)
-
-
-if __name__ == "__main__":
-    main()
+    return [
+        {
+            "env": walk,
+            "episode": records[-1].episode,
+            "env_steps": records[-1].env_steps,
+            "cpu_seconds": time.process_time() - start,
+            "memory_mb": memory_mb("VmRSS"),
+        }
+        for records in trainer.run()
+    ]

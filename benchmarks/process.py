@@ -1,47 +1,25 @@
 """Measuring in processes of their own: one thread each, nothing left over from the last one."""
 
-import csv
-import json
+import multiprocessing
 import os
-import platform
-import subprocess
-import sys
-from importlib import metadata
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.settings import ROOT
-
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
-PACKAGES = (
-    "torch",
-    "numpy",
-    "numba",
-    "gymnasium",
-    "pybullet",
-    "pybullet-envs-gymnasium",
-    "stable-baselines3",
-)
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def measured(module: str, *arguments: Any) -> Any:
-    """The JSON that `python -m benchmarks.module arguments` prints in its last line."""
-    run = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{module}", *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | ONE_THREAD,
-        capture_output=True,
-        text=True,
-    )
-    if run.returncode:
-        sys.exit(f"benchmarks.{module} {' '.join(map(str, arguments))} failed:\n{run.stderr}")
-    return json.loads(run.stdout.splitlines()[-1])
+def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What `function(*arguments)` returns in a new process with one thread."""
+    os.environ |= dict.fromkeys(THREADS, "1")
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), prepare) as pool:
+        return pool.submit(function, *arguments).result()
 
 
-def one_thread() -> None:
-    """What a measuring process begins with: no library uses more than one thread."""
+def prepare() -> None:
+    """From now on no library uses more than one thread, and what Bullet prints goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     import torch
     from threadpoolctl import threadpool_limits
 
@@ -49,17 +27,11 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
-def report(result: Any) -> None:
-    """What a measuring process ends with; see `measured`."""
-    print(json.dumps(result), flush=True)
-
-
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """A CSV file with the keys of the first row as its header."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    """A CSV file with the keys of the rows as its header."""
+    import pandas as pd  # not in the measuring processes, whose memory counts
+
+    pd.DataFrame(rows).to_csv(path, index=False)
 
 
 def memory_mb(which: str) -> float:
@@ -71,9 +43,3 @@ def memory_mb(which: str) -> float:
         if line.startswith(which + ":"):
             return int(line.split()[1]) / 1024
     raise LookupError(f"/proc/self/status has no {which}")
-
-
-def versions() -> str:
-    """Python and the packages that are measured, in one line."""
-    found = [f"{name} {metadata.version(name)}" for name in PACKAGES]
-    return ", ".join([f"python {platform.python_version()}", *found])

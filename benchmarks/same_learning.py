@@ -1,7 +1,7 @@
 """Does another checkout of this project learn the same? Both over many seeds.
 
     git worktree add /tmp/old COMMIT
-    .venv/bin/python -m benchmarks.same_learning /tmp/old 25
+    python -m benchmarks.same_learning /tmp/old 25
 
 Prints, for each environment and variant and both checkouts, the mean over seeds of the final return
 and of the episode at which the 50-episode average first covers three quarters of the way from the
@@ -31,8 +31,11 @@ import json, sys, torch
 from pathlib import Path
 sys.path.insert(0, "src")
 from threadpoolctl import threadpool_limits
-from mace_rl.study import read_study
 from mace_rl.train import Trainer
+try:
+    from mace_rl.config.study import read_study
+except ModuleNotFoundError:  # before the package had subpackages
+    from mace_rl.study import read_study
 torch.set_num_threads(1)
 environment, variant, episodes, seeds = *sys.argv[1:3], int(sys.argv[3]), int(sys.argv[4])
 study = read_study([Path("config.yaml")])

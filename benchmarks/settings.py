@@ -23,10 +23,8 @@ REFERENCE = "sb3_2048x4"  # the faster of the two peers: speed-ups are relative 
 VARIANTS = ("ppo", "mace_fixed", "mace_full")  # with the study's settings
 OURS = {"ppo_2048": "ppo"} | {variant: variant for variant in VARIANTS}  # and their variants
 
-# Steps of training before the clock starts: imports, compilation and the first updates are over.
-WARM_UP_STEPS = 2048
-# Seeds of the measurements; the study reports others.
-FIRST_SEED = 1000
+FIRST_SEED = 1000  # of the measurements; the study reports others
+CORES = 2  # of the workflow
 
 
 def contestants(environment: str) -> list[str]:
@@ -48,7 +46,7 @@ class Scale:
     growth_episodes: int
     workflow_episodes: int  # of each run of the small workflow ...
     workflow_seeds: int  # ... and how many of them, 3 environments × 3 variants
-    planned_seeds: int  # of the workflow that is only planned: 3 environments × 5 variants
+    planned_seeds: int  # of the workflow that is only planned, with every variant there is
 
 
 FULL = Scale(

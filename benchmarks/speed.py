@@ -1,22 +1,47 @@
 """Steps per second of everything in `settings.LABELS`, in turn: results.csv.
 
-`python -m benchmarks.speed CONTESTANT ENVIRONMENT SEED STEPS ...` is one measurement.
+What is timed are iterators that work while they are iterated over and yield the environment steps
+done so far, whenever that is known. What happens before the first `next` is not timed.
 """
 
-import sys
+import platform
 import time
 from collections.abc import Iterable, Iterator
-from typing import Any
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
 
-from benchmarks.process import (
-    measured,
-    memory_mb,
-    one_thread,
-    report,
-    versions,
-    write_rows,
-)
-from benchmarks.settings import ENVIRONMENTS, FIRST_SEED, OURS, WARM_UP_STEPS, Scale, contestants
+import gymnasium
+import numpy as np
+import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
+
+from benchmarks.process import in_fresh_process, memory_mb, write_rows
+from benchmarks.settings import ENVIRONMENTS, FIRST_SEED, OURS, ROOT, Scale, contestants
+
+if TYPE_CHECKING:  # imported where it is used: the others' memory should not hold it
+    from mace_rl.config.run import RunConfig
+
+# Steps of training before the clock starts: imports, compilation and the first updates are over.
+WARM_UP_STEPS = 2048
+ENDLESS = 10**9  # episodes
+PACKAGES = "torch numpy numba gymnasium pybullet pybullet-envs-gymnasium stable-baselines3"
+
+
+def measure_all(scale: Scale) -> None:
+    """Carry out all measurements and write results.csv, anew after each."""
+    from mace_rl.runs.provenance import cpu_model
+
+    versions = [f"{name} {metadata.version(name)}" for name in PACKAGES.split()]
+    versions = ", ".join([f"python {platform.python_version()}", *versions])
+    rows = []
+    for repeat, environment, contestant in schedule(scale.repeats):
+        stops = marks(scale, environment, contestant)
+        seed = FIRST_SEED + repeat
+        for reading in in_fresh_process(measure, contestant, environment, seed, stops):
+            identity = {"env": environment, "contestant": contestant, "repeat": repeat}
+            rows.append(identity | reading | {"cpu": cpu_model(), "versions": versions})
+        write_rows(scale.data / "results.csv", rows)
+        rate = rows[-1]["steps_per_second"]
+        print(f"repeat {repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
 
 
 def schedule(repeats: int) -> Iterator[tuple[int, str, str]]:
@@ -36,25 +61,19 @@ def marks(scale: Scale, environment: str, contestant: str) -> list[int]:
     """The numbers of steps at which the clock is read."""
     if contestant.startswith("environment"):
         return [scale.environment_steps[environment]]
-    if contestant in OURS:
-        return [scale.steps[environment], scale.later_steps[environment]]
-    return [scale.steps[environment]]
+    later = [scale.later_steps[environment]] if contestant in OURS else []
+    return [scale.steps[environment], *later]
 
 
-def measure_all(scale: Scale) -> None:
-    """Carry out all measurements and write results.csv, anew after each."""
-    from mace_rl.provenance import cpu_model
+def measure(contestant: str, environment: str, seed: int, stops: list[int]) -> list[dict[str, Any]]:
+    """The readings of one training, after another one as a warm-up."""
+    warm_up(contestant, environment, seed)
+    return read_clock(start(contestant, environment, seed, stops[-1]), stops)
 
-    origin = {"cpu": cpu_model(), "versions": versions()}
-    rows = []
-    for repeat, environment, contestant in schedule(scale.repeats):
-        stops = marks(scale, environment, contestant)
-        for reading in measured("speed", contestant, environment, FIRST_SEED + repeat, *stops):
-            identity = {"env": environment, "contestant": contestant, "repeat": repeat}
-            rows.append(identity | reading | origin)
-        write_rows(scale.data / "results.csv", rows)
-        rate = rows[-1]["steps_per_second"]
-        print(f"repeat {repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
+
+def warm_up(contestant: str, environment: str, seed: int) -> None:
+    """A short training with another seed."""
+    read_clock(start(contestant, environment, seed + 10**6, WARM_UP_STEPS), [WARM_UP_STEPS])
 
 
 def read_clock(progress: Iterable[int], stops: list[int]) -> list[dict[str, Any]]:
@@ -62,7 +81,7 @@ def read_clock(progress: Iterable[int], stops: list[int]) -> list[dict[str, Any]
 
     `steps`, those actually done, can be a little more: updates follow whole episodes.
     """
-    readings = []
+    readings: list[dict[str, Any]] = []
     seconds, cpu_seconds = time.perf_counter(), time.process_time()
     for steps in progress:
         while steps >= stops[len(readings)]:
@@ -82,17 +101,67 @@ def read_clock(progress: Iterable[int], stops: list[int]) -> list[dict[str, Any]
     raise RuntimeError(f"ended after {steps} steps, before {stops[-1]}")
 
 
-def main() -> None:
-    """One measurement."""
-    contestant, environment, seed, *stops = sys.argv[1:]
-    from benchmarks.contestants import start
+def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[int]:
+    """Prepare `contestant` for at least `steps` steps in `environment`."""
+    match contestant:
+        case "environment":
+            return alone(gymnasium.make(environment, disable_env_checker=True), seed, steps)
+        case "environment_fast":
+            from mace_rl.environments.environment import Environment
+            from mace_rl.streams import Streams
 
-    one_thread()
-    warm_up = start(contestant, environment, int(seed) + 10**6, WARM_UP_STEPS)
-    read_clock(warm_up, [WARM_UP_STEPS])
-    stops = [int(stop) for stop in stops]
-    report(read_clock(start(contestant, environment, int(seed), stops[-1]), stops))
+            ours = Environment(environment, Streams(seed).sequence("environment"))
+            return alone(ours.env, seed, steps)
+        case "sb3_default":
+            return stable_baselines3(environment, seed, steps)
+        case "sb3_2048x4":
+            full_batch = {"n_steps": 2048, "batch_size": 2048, "n_epochs": 4}
+            return stable_baselines3(environment, seed, steps, **full_batch)
+        case _:
+            from mace_rl.train import Trainer
+
+            trainer = Trainer(our_config(contestant, environment, seed))
+            return (records[-1].env_steps for records in trainer.run())
 
 
-if __name__ == "__main__":
-    main()
+def our_config(contestant: str, environment: str, seed: int) -> "RunConfig":
+    """The study's settings of one of `OURS`, but without an end."""
+    from mace_rl.config.study import read_study
+
+    config = read_study([ROOT / "config.yaml"]).run_config(environment, OURS[contestant], seed)
+    rollout_steps = 2048 if contestant == "ppo_2048" else config.ppo.rollout_steps
+    ppo = config.ppo.model_copy(update={"rollout_steps": rollout_steps})
+    return config.model_copy(update={"ppo": ppo, "episodes": ENDLESS})
+
+
+def alone(env: gymnasium.Env, seed: int, steps: int) -> Iterator[int]:
+    """Random actions, drawn beforehand; resets are part of the work."""
+    rng = np.random.default_rng(seed)
+    if isinstance(env.action_space, gymnasium.spaces.Discrete):
+        actions = rng.integers(env.action_space.n, size=steps).tolist()
+    else:
+        size = (steps, *env.action_space.shape)
+        actions = list(rng.uniform(-1, 1, size).astype(np.float32))
+    env.reset(seed=seed)
+
+    def play() -> Iterator[int]:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        yield steps
+
+    return play()
+
+
+def stable_baselines3(environment: str, seed: int, steps: int, **settings: int) -> Iterator[int]:
+    """stable-baselines3's PPO; `settings` are its own, all others its defaults."""
+    from stable_baselines3 import PPO
+
+    model = PPO("MlpPolicy", environment, seed=seed, device="cpu", **settings)
+
+    def learn() -> Iterator[int]:
+        model.learn(steps)
+        yield model.num_timesteps
+
+    return learn()

@@ -1,7 +1,7 @@
 """What Snakemake, imports and file writing add to training: workflow.csv and planning.csv.
 
 A small study is run for real, with two jobs at a time, in a folder of its own; what it shows is
-extrapolated to the paper's budgets by `aggregate.paper_budget`. A large study is only planned.
+extrapolated to the paper's budgets by `report.paper_budget`. A large study is only planned.
 """
 
 import json
@@ -14,68 +14,54 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 
-from benchmarks.process import ONE_THREAD, write_rows
-from benchmarks.settings import ENVIRONMENTS, ROOT, Scale
-
-CORES = 2
+from benchmarks.settings import CORES, ENVIRONMENTS, ROOT, Scale
 
 
 def measure_all(scale: Scale) -> None:
     """Run the small workflow, plan the large one, write both files."""
-    with tempfile.TemporaryDirectory(prefix="mace-rl-workflow-") as folder:
-        run_small(Path(folder), scale)
-    with tempfile.TemporaryDirectory(prefix="mace-rl-planning-") as folder:
-        plan_large(Path(folder), scale)
-
-
-def run_small(folder: Path, scale: Scale) -> None:
-    """Every environment and variant, few seeds and episodes; one row per run in workflow.csv."""
     budget = {"episodes": scale.workflow_episodes}
-    settings = {
+    small = {
         "seeds": list(range(scale.workflow_seeds)),
         "training": budget,
         "environment_settings": dict.fromkeys(ENVIRONMENTS, budget),
     }
-    began, ended = snakemake(folder, settings, f"-j{CORES}", "all")
-    whole = {"workflow_began": began, "workflow_ended": ended}
-    records = sorted(folder.glob("results/runs/*/*/seed*/run.json"))
-    rows = [job(record) | whole for record in records]
-    write_rows(scale.data / "workflow.csv", rows)
-    print(f"workflow: {len(rows)} runs in {ended - began:.0f} s")
+    with tempfile.TemporaryDirectory(prefix="mace-rl-workflow-") as folder:
+        began, ended = snakemake(Path(folder), small, "--cores", str(CORES), "all")
+        records = sorted(Path(folder).glob("results/runs/*/*/seed*/run.json"))
+        jobs = pd.DataFrame([job(record) for record in records])
+    jobs = jobs.assign(workflow_began=began, workflow_ended=ended)
+    jobs.to_csv(scale.data / "workflow.csv", index=False)
+    print(f"workflow: {len(jobs)} runs in {ended - began:.0f} s")
+
+    variants = yaml.safe_load((ROOT / "config.yaml").read_text(encoding="utf-8"))
+    variants = list(variants["variant_settings"])
+    large = {"variants": variants, "seeds": list(range(scale.planned_seeds))}
+    with tempfile.TemporaryDirectory(prefix="mace-rl-planning-") as folder:
+        began, ended = snakemake(Path(folder), large, "-n", "--quiet", "all")
+    runs = len(ENVIRONMENTS) * len(variants) * scale.planned_seeds
+    planning = pd.DataFrame({"runs": [runs], "seconds": [ended - began]})
+    planning.to_csv(scale.data / "planning.csv", index=False)
+    print(f"planning: {runs} runs in {ended - began:.1f} s")
 
 
 def job(record: Path) -> dict[str, Any]:
     """One run of the workflow: seconds of training, and when its job began and ended."""
     run = json.loads(record.read_text(encoding="utf-8"))
-    identity = {"env": run["config"]["environment"], "variant": run["config"]["variant"]}
-    runs = record.parents[3]
-    folder = record.relative_to(runs).parent
-    benchmark = runs.parent / "benchmarks" / "train" / folder.with_suffix(".tsv")
-    header, values = (line.split("\t") for line in benchmark.read_text().splitlines())
-    seconds = float(values[header.index("s")])
+    results, folder = record.parents[4], record.relative_to(record.parents[3]).parent
+    benchmark = results / "benchmarks" / "train" / folder.with_suffix(".tsv")
     ended = benchmark.stat().st_mtime  # Snakemake writes it when the job is over
-    return identity | {
+    return {
+        "env": run["config"]["environment"],
+        "variant": run["config"]["variant"],
         "seed": run["config"]["seed"],
         "training_seconds": run["seconds"],
-        "job_began": ended - seconds,
+        "job_began": ended - pd.read_csv(benchmark, sep="\t")["s"][0],
         "job_ended": ended,
         "peak_memory_mb": run["peak_memory_mb"],
     }
-
-
-def plan_large(folder: Path, scale: Scale) -> None:
-    """`snakemake -n` of every variant that has settings, with many seeds; planning.csv."""
-    variants = yaml.safe_load((ROOT / "config.yaml").read_text(encoding="utf-8"))
-    settings = {
-        "variants": list(variants["variant_settings"]),
-        "seeds": list(range(scale.planned_seeds)),
-    }
-    began, ended = snakemake(folder, settings, "-n", "--quiet", "all")
-    runs = len(ENVIRONMENTS) * len(settings["variants"]) * scale.planned_seeds
-    write_rows(scale.data / "planning.csv", [{"runs": runs, "seconds": ended - began}])
-    print(f"planning: {runs} runs in {ended - began:.1f} s")
 
 
 def snakemake(folder: Path, settings: dict[str, Any], *arguments: str) -> tuple[float, float]:
@@ -88,7 +74,7 @@ def snakemake(folder: Path, settings: dict[str, Any], *arguments: str) -> tuple[
     run = subprocess.run(
         [*command, "--configfile", "changes.yaml"],
         cwd=folder,
-        env=os.environ | ONE_THREAD | {"PYTHONUTF8": "1"},
+        env=os.environ | {"PYTHONUTF8": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

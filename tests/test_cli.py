@@ -6,12 +6,12 @@ import sys
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mace_rl import cli
-from mace_rl.hyperparameters import ConfigError
-from mace_rl.study import load_study
+from mace_rl.config.section import ConfigError
+from mace_rl.config.study import load_study
 
 CONFIG = yaml.safe_load(cli.CONFIG.read_text(encoding="utf-8"))
 
@@ -44,6 +44,19 @@ MISTAKES = {
     "config that is a folder": ({"--config": "/"}, ["/"]),
     "out below a file": ({"--out": f"{__file__}/run"}, ["test_cli.py"]),
 }
+# What an overlay's settings for FrozenLake-v1 make wrong, noticed when the run is to begin.
+MISFITS = {
+    "unknown argument": ("environment_arguments: {slippery: false}", ["FrozenLake-v1", "slippery"]),
+    "argument's value": ("environment_arguments: {map_name: 9x9}", ["FrozenLake-v1", "9x9"]),
+    "network's outputs": (
+        "ppo: {network: {kind: torch, module: 'test_network:headless'}}",
+        ["ppo.network.module", "headless", "(2, 64)", "(2, 4)"],
+    ),
+    "code that is not there": (
+        "ppo: {network: {kind: torch, module: 'shared:nothing'}}",
+        ["ppo.network.module", "'shared:nothing'", "'nothing'"],
+    ),
+}
 # Mistakes in the form of the command, which argparse answers with the usage and its reason.
 MALFORMED = {
     "no command": [],
@@ -55,6 +68,7 @@ MALFORMED = {
     "seed that is no integer": ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
     "episodes that are text": ["train", *sum(GOOD.items(), ()), "--out", "x", "--episodes", "1e3"],
     "option without value": ["train", "--env"],
+    "unknown engine": ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
     "verify without folder": ["verify"],
     "evaluate without folder": ["evaluate", "--episodes", "3"],
 }
@@ -70,6 +84,49 @@ def test_a_mistake_gets_one_line(name, monkeypatch, tmp_path):
     for fragment in expected:
         assert fragment in message
     assert not (tmp_path / "run").exists()
+
+
+def overlay(folder, environment: str, settings: str) -> str:
+    """A file with settings, in YAML, of one environment."""
+    path = folder / "overlay.yaml"
+    path.write_text(f"environment_settings: {{{environment}: {{{settings}}}}}", encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", MISFITS)
+def test_settings_that_do_not_fit_the_environment_get_one_line(name, monkeypatch, tmp_path):
+    settings, expected = MISFITS[name]
+    config = overlay(tmp_path, "FrozenLake-v1", settings)
+    options = GOOD | {"--env": "FrozenLake-v1", "--config": config, "--out": str(tmp_path / "run")}
+    code, message = call(monkeypatch, "train", *sum(options.items(), ()))
+    assert code == 1
+    assert message.startswith("mace-rl: ") and "\n" not in message
+    for fragment in expected:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+@pytest.mark.parametrize(
+    ("environment", "settings", "lengths"),
+    [
+        ("CliffWalking-v1", "max_episode_steps: 7", [7]),
+        # Without slipping the way to the goal takes at least six steps, to a hole two.
+        ("FrozenLake-v1", "environment_arguments: {is_slippery: false}", range(2, 101)),
+    ],
+)
+def test_an_environment_is_made_as_the_config_says(
+    monkeypatch, tmp_path, environment, settings, lengths, engine
+):
+    config, out = overlay(tmp_path, environment, settings), tmp_path / "run"
+    options = {"--env": environment, "--variant": "mace_full", "--config": config}
+    options = GOOD | options | {"--out": str(out), "--engine": engine}
+    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    key, value = yaml.safe_load(settings).popitem()
+    assert record["config"][key] == value and record["config"]["engine"] == engine
+    rows = [row.split(",") for row in (out / "episodes.csv").read_text().splitlines()[1:]]
+    assert all(int(row[2]) in lengths for row in rows)
+    assert call(monkeypatch, "evaluate", str(out), "--episodes", "2") == (0, "")
 
 
 @pytest.mark.parametrize("name", MALFORMED)
@@ -101,6 +158,7 @@ ANYTHING = st.one_of(
 
 @settings(max_examples=300, deadline=None)
 @given(path=st.sampled_from(leaves(CONFIG)), value=ANYTHING, extra=st.none() | st.text(max_size=6))
+@example(path=("variant_settings", "ppo", "beta", "kind"), value="\n", extra=None)
 def test_anything_in_place_of_a_value_is_accepted_or_refused_in_one_line(path, value, extra):
     config = json.loads(json.dumps(CONFIG))
     section = config
@@ -120,13 +178,31 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     out = tmp_path / "a run with ümlaut"
     options = sum((GOOD | {"--out": str(out)}).items(), ())
     assert call(monkeypatch, "train", *options) == (0, "")
-    assert {path.name for path in out.iterdir()} == {"agent.pt", "episodes.csv", "run.json"}
+    results = {"agent.pt", "diagnostics.csv", "episodes.csv", "run.json"}
+    assert {path.name for path in out.iterdir()} == results
     records = (out / "episodes.csv").read_bytes()
     assert call(monkeypatch, "train", *options) == (0, "")
     assert "finished" in caplog.text
-    code, message = call(monkeypatch, "train", *options, "--seed", "1")
-    assert code == 1 and "seed is 0, not 1" in message
+    limited = overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9")
+    for change, difference in {
+        ("--seed", "1"): "seed is 0, not 1",
+        ("--engine", "torch"): "engine is 'compiled', not 'torch'",
+        ("--config", limited): "max_episode_steps is None, not 9",
+    }.items():
+        code, message = call(monkeypatch, "train", *options, *change)
+        assert code == 1 and difference in message
     assert (out / "episodes.csv").read_bytes() == records
+    # And where a setting of the finished run is none of this one's.
+    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    record["config"]["max_episode_steps"] = 9
+    (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    code, message = call(monkeypatch, "train", *options)
+    assert code == 1 and "max_episode_steps is 9, not None" in message
+    # As an earlier version of this program wrote it: every section, no key that came later.
+    del record["config"]["max_episode_steps"], record["config"]["engine"]
+    record["config"]["meta"] = CONFIG["training"]["meta"]
+    (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    assert call(monkeypatch, "train", *options) == (0, "")
 
 
 @pytest.fixture
@@ -139,42 +215,30 @@ def reference(monkeypatch, tmp_path):
 
 
 def test_an_agent_plays_as_at_the_end_of_its_training(monkeypatch, tmp_path, capsys):
-    """Its returns are those of a trainer that trained it here and plays on."""
+    """Its return is that of its torch modules in the library's own environment."""
     import gymnasium
     import numpy as np
     import torch
 
-    from mace_rl.evaluate import evaluate, load_agent
+    from mace_rl.runs.agent import load_agent
+    from mace_rl.runs.evaluate import evaluate
 
     options = GOOD | {"--env": "HopperBulletEnv-v0", "--episodes": "6", "--out": str(tmp_path)}
     assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
     assert call(monkeypatch, "evaluate", str(tmp_path), "--episodes", "3") == (0, "")
     assert capsys.readouterr().out.startswith("3 episodes: mean return ")
-    agent = load_agent(tmp_path)
-    actor, mean = agent.ppo.actor, agent.ppo.standardiser.mean
-    env = gymnasium.make("HopperBulletEnv-v0")
-    generator = np.random.default_rng(5)
-    for _ in range(2):  # the library's own environment; its first reset is thrown away
-        observation, _ = env.reset(seed=5)
+    policy, env = load_agent(tmp_path).policy, gymnasium.make("HopperBulletEnv-v0")
+    noise = torch.from_numpy(np.random.default_rng(5).standard_normal((1000, 3)))
+    env.reset(seed=5)  # an environment's first reset is thrown away
+    env.reset(seed=5)
     observation, _ = env.reset()
-    noise = generator.standard_normal((1000, 3))
-    layers = [
-        (torch.from_numpy(weights.copy()), torch.from_numpy(biases.copy()))
-        for weights, biases in zip(actor.weights, actor.biases, strict=True)
-    ]
     total = 0.0
-    for step in range(1000):
-        x = np.clip((observation - mean) / agent.ppo.standardiser.std, -10, 10)
-        hidden = torch.from_numpy(x.astype(np.float32))
-        for weights, biases in layers[:-1]:
-            hidden = torch.tanh(hidden @ weights + biases)
-        action = (hidden @ layers[-1][0] + layers[-1][1]).numpy()
-        action = action + np.exp(actor.log_std) * noise[step]
-        observation, reward, terminated, truncated, _ = env.step(
-            np.clip(action, -1, 1).astype(np.float32)
-        )
+    for row in noise:
+        distribution = policy(observation)
+        action = (distribution.mean + distribution.stddev * row).detach().clip(-1, 1)
+        observation, reward, *ends, _ = env.step(action.float().numpy())
         total += reward
-        if terminated or truncated:
+        if any(ends):
             break
     assert evaluate(tmp_path, 1, 5)[0] == pytest.approx(total, rel=1e-3)
     (tmp_path / "agent.pt").write_bytes((tmp_path / "agent.pt").read_bytes()[:-7])
@@ -220,7 +284,7 @@ def test_damaged_references_are_refused(damage, reference, monkeypatch):
 
 
 def test_verify_counts_agreement_by_hand():
-    from mace_rl.verify import Repetition, verdict
+    from mace_rl.runs.verify import Repetition, verdict
 
     def run(then: float, now: float, equal: bool = False) -> Repetition:
         return Repetition("a run", equal, None if equal else 1, (then, now), 2.0, "cpu")

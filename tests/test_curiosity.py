@@ -4,10 +4,12 @@ import copy
 
 import numpy as np
 import pytest
+from shared import environment_of
 
-from mace_rl.curiosity import Curiosity, relevance
-from mace_rl.environments import Environment
-from mace_rl.rollout import Episode
+from mace_rl import train
+from mace_rl.bonus.curiosity import Curiosity, relevance
+from mace_rl.environments.rollout import Episode
+from mace_rl.streams import Streams
 
 RETURNS = np.float32([-20, -10, 0, 10, 20])  # mean 0, standard deviation √200
 
@@ -42,7 +44,7 @@ def make(run_config):
     def build(environment="CartPole-v1", **changes) -> Curiosity:
         changes = {"memory": {"write_every": 1}, "novelty": {"write_every": 1}} | changes
         config = run_config(environment, "mace_full", 0, **changes)
-        return Curiosity(config, Environment(environment, 0))
+        return train.curiosity(config, environment_of(environment), Streams(0))
 
     return build
 
@@ -50,27 +52,22 @@ def make(run_config):
 # --- Relevance ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [-1000.0, -20.0, 0.0, 20.0, 1000.0])
-def test_nothing_similar_is_fully_relevant(value):
-    assert relevance_of(0.0, value) == 1
-
-
-def test_similar_and_unproductive_goes_to_0():
-    values = [relevance_of(1.0, v) for v in (0, -20, -40, -100)]
-    assert values[0] == pytest.approx(0.5)
-    assert values == sorted(values, reverse=True)
-    assert values[1] < 0.2 and values[3] < 0.001
-
-
-def test_similar_and_productive_stays_near_1():
-    values = [relevance_of(1.0, v) for v in (0, 20, 40, 100)]
-    assert values == sorted(values) and values[1] > 0.8 and values[3] > 0.999
-
-
-def test_relevance_by_hand():
-    # (10 − 0) / √200 = 0.7071; the logistic function of it is 0.66976; 1 − ½ (1 − 0.66976).
-    found = relevance_of(0.5, 10.0)
-    assert found == pytest.approx(0.83488, abs=1e-5)
+@pytest.mark.parametrize(
+    ("similarity", "value", "expected"),
+    [
+        *((0.0, value, 1.0) for value in (-1000.0, 0.0, 1000.0)),  # unlike all: fully relevant
+        # Like what was: the logistic function of value / √200, to 0 where it was unproductive ...
+        *((1.0, 0.0, 0.5), (1.0, -20.0, 0.19557), (1.0, -100.0, 0.00085)),
+        *((1.0, 20.0, 0.80443), (1.0, 100.0, 0.99915)),  # ... and near 1 where it was productive
+        (
+            0.5,
+            10.0,
+            0.83488,
+        ),  # 10 / √200 = 0.7071; the function of it, 0.66976; 1 − ½ (1 − 0.66976)
+    ],
+)
+def test_relevance_by_hand(similarity, value, expected):
+    assert relevance_of(similarity, value) == pytest.approx(expected, abs=1e-5)
 
 
 def test_relevance_does_not_depend_on_the_unit_of_reward():
@@ -96,7 +93,9 @@ def test_relevance_is_in_the_middle_if_all_returns_are_equal_up_to_rounding():
 
 
 def test_first_episode_is_wholly_new(make):
-    assert make().bonus(wander(0)).tolist() == [1.0] * 30
+    bonus = make().bonus(wander(0))
+    assert bonus.reward.tolist() == bonus.relevance.tolist() == [1.0] * 30
+    assert bonus.similarity.tolist() == [0.0] * 30
 
 
 def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
@@ -110,7 +109,7 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
     apart = copy.deepcopy(curiosity)
     novelty = apart.novelty(arrived)
     entries = apart.memory.usage > 0
-    mean, std = apart.embedding.mean, apart.embedding.std
+    mean, std = apart.normaliser.mean, apart.normaliser.std
     keys, values = apart.memory.keys[entries].numpy(), apart.memory.values[entries].numpy()
     found = curiosity.bonus(episode)
     for t, state in enumerate(arrived):
@@ -120,7 +119,8 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
         recalled = (kernel * values[nearest, -1]).sum() / kernel.sum()
         z = (recalled - values[:, -1].mean()) / values[:, -1].std()
         relevant = 1 - 0.1 * kernel.max() * (1 - 1 / (1 + np.exp(-z)))
-        assert found[t] == pytest.approx(novelty[t] * relevant, rel=1e-3)
+        expected = novelty[t] * relevant, novelty[t], relevant, 0.1 * kernel.max()
+        assert [part[t] for part in found] == pytest.approx(expected, rel=1e-3)
 
 
 def test_bonus_is_for_the_state_reached_and_the_start_does_not_count(make):
@@ -130,10 +130,10 @@ def test_bonus_is_for_the_state_reached_and_the_start_does_not_count(make):
     episode = wander(9)
     moved = wander(9)
     moved.observations[0] += 100
-    assert (curiosity.bonus(episode) == curiosity.bonus(moved)).all()
+    assert (curiosity.bonus(episode).reward == curiosity.bonus(moved).reward).all()
     moved.observations[-1] += 100
-    assert (curiosity.bonus(moved)[:-1] == curiosity.bonus(episode)[:-1]).all()
-    assert curiosity.bonus(moved)[-1] > 0.99
+    before, after = curiosity.bonus(episode).reward, curiosity.bonus(moved).reward
+    assert (before[:-1] == after[:-1]).all() and after[-1] > 0.99
 
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
@@ -145,9 +145,8 @@ def test_bonus_is_within_0_and_1(make, name):
             episode = wander(seed, centre=0.2 * seed, scale=10.0 ** (seed % 4 - 2))
         else:
             episode = episode_of(np.eye(16)[rng.integers(16, size=31)])
-        bonus = curiosity.bonus(episode)
-        assert bonus.shape == (30,) and bonus.dtype == np.float64
-        assert ((bonus >= 0) & (bonus <= 1)).all()
+        for part in curiosity.bonus(episode):
+            assert part.shape == (30,) and ((part >= 0) & (part <= 1)).all()
         curiosity.remember(episode, 50 * rng.standard_normal(30))
 
 
@@ -158,7 +157,7 @@ def test_familiar_and_unproductive_states_earn_least(make):
         curiosity.remember(wander(seed, centre=-1.0), np.full(30, -50.0))
         curiosity.remember(wander(100 + seed, centre=1.0), np.full(30, 50.0))
     poor, rich, unseen = (
-        curiosity.bonus(wander(50, centre=centre)).mean() for centre in (-1.0, 1.0, 8.0)
+        curiosity.bonus(wander(50, centre=centre)).reward.mean() for centre in (-1.0, 1.0, 8.0)
     )
     assert poor < 0.5 * rich < rich < 0.6 < 0.95 < unseen
 
@@ -166,9 +165,9 @@ def test_familiar_and_unproductive_states_earn_least(make):
 @pytest.mark.parametrize("name", ["FrozenLake-v1", "Taxi-v4"])
 def test_different_discrete_states_are_not_similar(make, name):
     curiosity = make(name)
-    states = np.eye(curiosity.embedding.mean.size)
+    states = np.eye(curiosity.normaliser.mean.size)
     curiosity.remember(episode_of(states[[0, 0, 0]]), np.array([-50.0, 50.0]))
-    new = curiosity.bonus(episode_of(states[[0, 1]]))[0]
+    new = curiosity.bonus(episode_of(states[[0, 1]])).reward[0]
     assert new > 0.95  # neither visited nor like what was
 
 
@@ -183,24 +182,24 @@ def test_remembering_stores_one_step_in_write_every(make):
     assert stored[:, 4:].tolist() == [[0, 0], [4, 40], [8, 80]]
 
 
-def test_states_are_compared_in_the_standardisation_of_all_remembered(make):
+def test_states_are_compared_in_the_normaliser_of_all_remembered(make):
     """Discrete ones are one-hot and stay as they are."""
     curiosity, states = make(), []
     for seed in range(3):
         curiosity.remember(wander(seed, centre=5.0, scale=2.0), np.zeros(30))
         states += [*wander(seed, centre=5.0, scale=2.0).observations[1:].astype(np.float64)]
-    np.testing.assert_allclose(curiosity.embedding.mean, np.mean(states, axis=0))
-    np.testing.assert_allclose(curiosity.embedding.std, np.std(states, axis=0))
+    np.testing.assert_allclose(curiosity.normaliser.mean, np.mean(states, axis=0))
+    np.testing.assert_allclose(curiosity.normaliser.std, np.std(states, axis=0))
     discrete = make("FrozenLake-v1")
     discrete.remember(episode_of(np.eye(16)[[0, 4, 8, 9]]), np.zeros(3))
-    assert (discrete.embedding.mean == 0).all() and (discrete.embedding.std == 1).all()
+    assert (discrete.normaliser.mean == 0).all() and (discrete.normaliser.std == 1).all()
 
 
 def test_appraisal_comes_before_remembering(make):
     """An episode is rewarded for what was known before it: asking changes nothing known."""
     curiosity = make()
     curiosity.remember(wander(0), np.zeros(30))
-    assert (curiosity.bonus(wander(1)) == curiosity.bonus(wander(1))).all()
+    np.testing.assert_equal(*(curiosity.bonus(wander(1)) for _ in range(2)))
 
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
@@ -219,7 +218,7 @@ def test_restored_curiosity_continues_to_the_bit(make, name):
     restored.load_state_dict(copy.deepcopy(original.state_dict()))
     for _ in range(4):
         played, returns = episode(), rng.standard_normal(30)
-        assert (original.bonus(played) == restored.bonus(played)).all()
+        np.testing.assert_equal(original.bonus(played), restored.bonus(played))
         original.remember(played, returns)
         restored.remember(played, returns)
     assert (original.memory.usage == restored.memory.usage).all()

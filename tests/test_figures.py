@@ -1,10 +1,11 @@
-"""Figure 1: its data against pandas and scipy, and what is drawn against its data."""
+"""The figures: their data against pandas and scipy, and what is drawn against the data."""
 
 import math
 import struct
 import subprocess
 import sys
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,21 +13,15 @@ import pytest
 import scipy.stats
 from matplotlib.colors import same_color
 
-from mace_rl.figures import FigureConfig, figure1, learning_curves, save_figure, seed_curves
-from mace_rl.hyperparameters import ConfigError, check
-from mace_rl.metrics import MetricsConfig
-from mace_rl.records import RecordError
+from mace_rl.config.results import FigureConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.config.study import read_study
+from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.records import RecordError
 
-METRICS = MetricsConfig(
-    final_fraction=0.1,
-    threshold=0.75,
-    moving_average=5,
-    convergence_band=0.1,
-    confidence=0.95,
-    bootstrap_repetitions=500,
-    bootstrap_seed=0,
-    random_return={},
-)
+STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
+METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
+RETURN, BETA = quantity("1", METRICS), quantity("2", METRICS)
 LABELS = {"ppo": "PPO (Baseline)", "mace_full": "MACE-RL (Full β)"}
 COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
 
@@ -34,18 +29,24 @@ COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
 def frames(environments=("A-v0", "B-v1"), seeds=3, episodes=40):
     draws = np.random.default_rng(0)
     return {
-        run: pd.DataFrame({"extrinsic_return": np.cumsum(draws.normal(size=episodes))})
+        run: pd.DataFrame(
+            {
+                "extrinsic_return": np.cumsum(draws.normal(size=episodes)),
+                "beta": draws.random(episodes) * (run[1] != "ppo"),
+            }
+        )
         for run in product(environments, LABELS, range(seeds))
     }
 
 
-def data(**shape):
-    single = seed_curves(frames(**shape), METRICS.moving_average)
-    return learning_curves(single, METRICS), single
+def data(shown=RETURN, runs=None, **shape):
+    single = seed_curves(runs or frames(**shape), shown)
+    return mean_curves(single, shown, METRICS), single
 
 
-def draw(columns=3, colours=COLOURS, **shape):
-    return figure1(*data(**shape), FigureConfig(columns=columns), METRICS, LABELS, colours)
+def draw(columns=3, colours=COLOURS, shown=RETURN, **shape):
+    layout = FigureConfig(columns=columns)
+    return draw_figure(*data(shown, **shape), shown, layout, 0.95, LABELS, colours)
 
 
 def at(frame, **values):
@@ -54,29 +55,22 @@ def at(frame, **values):
     return frame
 
 
-def test_a_seeds_curve_is_the_moving_average_of_the_episodes_so_far():
-    runs = frames()
-    single = seed_curves(runs, 5)
+@pytest.mark.parametrize("episodes", [1, 4, 5, 6, 40])
+def test_a_seeds_curve_is_the_moving_average_of_the_episodes_so_far(episodes):
+    runs = frames(episodes=episodes)
+    single = seed_curves(runs, RETURN)
     assert list(single.columns) == ["env", "variant", "seed", "episode", "moving_average"]
     for (environment, variant, seed), run in runs.items():
         curve = at(single, env=environment, variant=variant, seed=seed)
-        assert curve["episode"].tolist() == list(range(1, 41))
+        assert curve["episode"].tolist() == list(range(1, episodes + 1))
         expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
         np.testing.assert_allclose(curve["moving_average"], expected)
-
-
-@pytest.mark.parametrize("episodes", [1, 4, 5, 6])
-def test_runs_about_as_long_as_the_window(episodes):
-    run = frames(episodes=episodes)["A-v0", "ppo", 0]
-    curve = seed_curves({("A-v0", "ppo", 0): run}, 5)
-    expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
-    np.testing.assert_allclose(curve["moving_average"], expected)
 
 
 @pytest.mark.parametrize(("episodes", "points"), [(1000, 1000), (1001, 501), (6000, 1000)])
 def test_long_curves_are_thinned_and_end_at_the_last_episode(episodes, points):
     run = frames(("A-v0",), 1, episodes)["A-v0", "ppo", 0]
-    curve = seed_curves({("A-v0", "ppo", 0): run}, 5)
+    curve = seed_curves({("A-v0", "ppo", 0): run}, RETURN)
     assert len(curve) == points
     assert curve["episode"].iloc[-1] == episodes
     assert set(np.diff(curve["episode"])) == {math.ceil(episodes / 1000)}
@@ -84,7 +78,7 @@ def test_long_curves_are_thinned_and_end_at_the_last_episode(episodes, points):
     np.testing.assert_allclose(curve["moving_average"], full[curve["episode"] - 1])
 
 
-def test_learning_curves_against_scipy_point_by_point():
+def test_mean_curves_against_scipy_point_by_point():
     curves, single = data(seeds=4)
     assert list(curves.columns) == ["env", "variant", "episode", "mean", "lower", "upper", "n"]
     assert len(curves) == 2 * 2 * 40
@@ -106,8 +100,7 @@ def test_from_ten_seeds_on_the_band_is_the_same_bootstrap_every_time():
 
 def test_one_seed_has_a_mean_and_no_band():
     curves, single = data(seeds=1)
-    assert curves["lower"].isna().all()
-    assert curves["upper"].isna().all()
+    assert curves[["lower", "upper"]].isna().all(axis=None)
     np.testing.assert_array_equal(curves["mean"], single["moving_average"])
 
 
@@ -115,13 +108,7 @@ def test_seeds_of_different_lengths_are_refused():
     runs = frames()
     runs["B-v1", "ppo", 1] = runs["B-v1", "ppo", 1].iloc[:-1]
     with pytest.raises(RecordError, match="the seeds of B-v1, ppo differ in their episodes"):
-        learning_curves(seed_curves(runs, 5), METRICS)
-
-
-def test_the_data_comes_back_from_csv_to_the_bit(tmp_path):
-    for written in data():
-        written.to_csv(tmp_path / "data.csv", index=False)
-        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "data.csv"), written, check_exact=True)
+        data(runs=runs)
 
 
 def test_one_panel_per_environment_shows_the_data():
@@ -130,6 +117,8 @@ def test_one_panel_per_environment_shows_the_data():
     assert [axes.get_title() for axes in figure.axes] == ["A-v0", "B-v1"]
     assert figure.axes[0].get_ylabel() == "Extrinsic return\n(mean of 5 episodes)"
     assert {axes.get_xlabel() for axes in figure.axes} == {"Training episodes"}
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == list(LABELS.values())
     for axes in figure.axes:
         means = [line for line in axes.get_lines() if line.get_label() in LABELS.values()]
         assert [line.get_label() for line in means] == list(LABELS.values())
@@ -167,15 +156,8 @@ def test_few_seeds(seeds, bands, faint):
     assert len(figure.axes[0].collections) == bands
     assert len(figure.axes[0].get_lines()) == 2 + faint
     (legend,) = figure.legends
+    assert (f"{seeds} seeds" in legend.get_title().get_text()) == (seeds > 1)
     assert ("95 % interval" in legend.get_title().get_text()) == (bands > 0)
-
-
-def test_the_legend_stands_once_and_names_every_variant():
-    figure = draw()
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == list(LABELS.values())
-    assert "3 seeds" in legend.get_title().get_text()
-    assert all(axes.get_legend() is None for axes in figure.axes)
 
 
 @pytest.mark.parametrize(("environments", "columns"), [(1, 3), (2, 1), (4, 3), (5, 2), (7, 3)])
@@ -192,10 +174,37 @@ def test_any_number_of_environments(environments, columns, tmp_path):
 
 def test_a_constant_return_can_be_drawn(tmp_path):
     runs = {run: frame * 0 + 500 for run, frame in frames(seeds=3).items()}
-    single = seed_curves(runs, 5)
-    figure = figure1(
-        learning_curves(single, METRICS), single, FigureConfig(columns=3), METRICS, LABELS, COLOURS
-    )
+    save_figure(draw(runs=runs), tmp_path / "figure.pdf")
+
+
+def test_figure_2_shows_beta_as_it_was_without_variants_that_have_none():
+    curves, single = data(BETA)
+    assert set(curves["variant"]) == set(single["variant"]) == {"mace_full"}
+    for (environment, variant, seed), run in frames().items():
+        beta = at(single, env=environment, variant=variant, seed=seed)["beta"].tolist()
+        assert beta == (run["beta"].tolist() if variant == "mace_full" else [])
+    for row in curves.itertuples():
+        beta = at(single, env=row.env, episode=row.episode)["beta"]
+        bounds = scipy.stats.t.interval(0.95, 2, beta.mean(), beta.sem())
+        assert row.mean == pytest.approx(beta.mean())
+        assert (row.lower, row.upper) == pytest.approx((max(bounds[0], 0), min(bounds[1], 1)))
+    figure = draw(shown=BETA)
+    assert [axes.get_title() for axes in figure.axes] == ["A-v0", "B-v1"]
+    assert {axes.get_ylim() for axes in figure.axes} == {(0, 1)}
+    assert figure.axes[0].get_ylabel() == "β"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [LABELS["mace_full"]]
+    once = {run: frame * 0 for run, frame in frames().items()}  # one β above 0 is enough
+    once["B-v1", "ppo", 2].loc[7, "beta"] = 0.1
+    assert set(data(BETA, once)[0]["variant"]) == {"ppo"}
+
+
+def test_a_study_without_beta_has_a_figure_that_says_so(tmp_path):
+    plain = {run: frame for run, frame in frames().items() if run[1] == "ppo"}
+    for name, written in zip(("curves", "seeds"), data(BETA, plain), strict=True):
+        written.to_csv(tmp_path / f"{name}.csv", index=False)
+    read = [pd.read_csv(tmp_path / f"{name}.csv") for name in ("curves", "seeds")]
+    figure = draw_figure(*read, BETA, FigureConfig(columns=3), 0.95, LABELS, COLOURS)
+    assert [text.get_text() for text in figure.axes[0].texts] == ["β is 0 in every run"]
     save_figure(figure, tmp_path / "figure.pdf")
 
 
@@ -244,11 +253,8 @@ def test_importing_results_modules_is_quick():
     """Planning the workflow imports them; tables and figures do without torch altogether."""
     heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}
     slow = heavy | {"pandas", "matplotlib.figure", "seaborn", "scipy.stats"}
-    code = (
-        "import sys; import mace_rl.{}; from mace_rl import records, metrics, statistics, figures;"
-        "print(*(set({}) & set(sys.modules)))"
-    )
-    for module, forbidden in (("figures", slow), ("tables", heavy)):
+    code = "import sys, mace_rl.results.{}; print(*(set({}) & set(sys.modules)))"
+    for module, forbidden in (("figures", slow), ("tables", heavy), ("comparisons", heavy)):
         command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
         run = subprocess.run(command, capture_output=True, text=True, check=True)
         assert run.stdout.split() == []

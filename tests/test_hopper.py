@@ -10,8 +10,8 @@ from gymnasium.wrappers import TimeLimit
 from pybullet_envs_gymnasium.gym_locomotion_envs import HopperBulletEnv
 from pybullet_envs_gymnasium.scene_stadium import SinglePlayerStadiumScene
 
-from mace_rl import hopper
-from mace_rl.hopper import FastHopperBulletEnv
+from mace_rl.environments import hopper
+from mace_rl.environments.hopper import FastHopperBulletEnv
 
 # The action [3] for a random generator, a state [15] and the number of the step in its episode.
 Policy = Callable[[np.random.Generator, np.ndarray, int], np.ndarray]
@@ -129,6 +129,7 @@ def pair():
     theirs.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
     ("policy", "steps", "longest"),

@@ -6,9 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mace_rl.hyperparameters import MemoryConfig
-from mace_rl.memory import EpisodicMemory, Recollection
-from mace_rl.nearest import nearest
+from mace_rl.bonus.memory import EpisodicMemory, Recollection
+from mace_rl.bonus.nearest import nearest
+from mace_rl.config.run import MemoryConfig
 
 ORIGIN, UNIT = torch.zeros(3), torch.ones(3)  # the identity as an embedding
 
@@ -43,14 +43,6 @@ def test_nearest_equals_a_full_sort(size, total, count):
     np.testing.assert_allclose(squares, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(np.take_along_axis(exact, indices, 1), expected, rtol=1e-5)
     assert all(len(set(row)) == count for row in indices.tolist())
-
-
-def test_nearest_of_equally_distant_points_are_the_first():
-    points = np.array([[2], [1], [3], [1], [0], [1], [2]], np.float32)
-    identity = np.zeros(1, np.float32), np.ones(1, np.float32)
-    squares, indices = nearest(np.array([[1], [2.5]], np.float32), points, *identity, 5)
-    assert indices.tolist() == [[1, 3, 5, 0, 4], [0, 2, 6, 1, 3]]
-    assert squares.tolist() == [[0, 0, 0, 1, 1], [0.25, 0.25, 0.25, 2.25, 2.25]]
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -248,15 +240,6 @@ def test_replacement_equals_a_model_of_least_recently_used(operations, capacity,
         assert held == [key for _, key in model.slots]
         assert len(memory) == min(sum(key is not None for key in held), capacity)
         assert memory.returns.tolist() == [key for key in held if key is not None]
-
-
-def test_what_is_read_outlives_what_is_not():
-    memory = make_memory(capacity=3, neighbours=1, key_size=1)
-    for key in (1.0, 2.0, 3.0):
-        memory.write(*[torch.tensor([[key]])] * 2, *[torch.tensor([key])] * 2)
-    memory.lookup(torch.tensor([[1.1]]), torch.zeros(1), torch.ones(1))
-    memory.write(*[torch.tensor([[4.0]])] * 2, *[torch.tensor([4.0])] * 2)
-    assert sorted(memory.returns.tolist()) == [1, 3, 4]  # 2 went, though 1 was older
 
 
 def test_values_are_next_state_reward_and_return():

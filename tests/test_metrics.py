@@ -1,5 +1,6 @@
 """Metrics on curves whose answers are known by hand, and against plain loops."""
 
+import sys
 from decimal import ROUND_CEILING, Decimal
 from itertools import product
 
@@ -7,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mace_rl import metrics as m
-from mace_rl.hyperparameters import ConfigError, check
-from mace_rl.records import RecordError
+from mace_rl.config.results import MetricsConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.results import metrics as m
+from mace_rl.results.records import RecordError
 
 SETTINGS = {
     "final_fraction": 0.1,
@@ -21,7 +23,29 @@ SETTINGS = {
     "bootstrap_seed": 0,
     "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
 }
-CONFIG = check(m.MetricsConfig, SETTINGS, "test")
+CONFIG = check(MetricsConfig, SETTINGS, "test")
+ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
+    "env": "CartPole-v1",
+    "variant": "ppo",
+    "seed": 4,
+    "episodes": 1000,
+    "env_steps": 9000,
+    "final_return": 500.0,
+    "sample_efficiency": 201,
+    "convergence_steps": 300,  # both windows of 50 at 500: episodes 201 to 300
+    "area_under_curve": 404.0,
+    "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
+    "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
+    "convergence_steps_flattest": 100,
+    "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
+    "sample_efficiency_censored": 0,
+    "convergence_steps_censored": 0,
+    "sample_efficiency_range_censored": 0,
+    "convergence_steps_range_censored": 0,
+    "convergence_steps_flattest_censored": 0,
+    "convergence_steps_public_code_censored": 0,
+}
+COLUMNS = list(ROW)
 ENVIRONMENTS, VARIANTS, SEEDS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_full"], [3, 1]
 
 
@@ -30,6 +54,12 @@ def ramp(flat_before, rise, flat_after):
     return np.concatenate(
         [np.zeros(flat_before), np.arange(1.0, rise + 1), np.full(flat_after, float(rise))]
     )
+
+
+def curve(returns, final=np.nan, random=np.nan, **settings):
+    """What a metric gets; settings that are not given are those above."""
+    changed = CONFIG.model_copy(update=settings)
+    return m.LearningCurve(np.asarray(returns), final, random, changed)
 
 
 def noisy(seed, episodes=400):
@@ -50,9 +80,6 @@ def frame(returns, length=1):
     return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
 
 
-# final return
-
-
 def test_final_return_by_hand():
     assert m.final_return(np.arange(20.0), 0.1) == 18.5  # of 18 and 19
     assert m.final_return(np.arange(2000.0), 0.1) == np.mean(range(1800, 2000))
@@ -69,39 +96,27 @@ def test_the_last_part_is_rounded_up_in_decimal(fraction):
         assert m.final_return(returns, float(fraction)) == np.mean(returns[episodes - last :])
 
 
-# the paper's sample efficiency
-
-
 def test_sample_efficiency_is_the_first_single_episode():
     returns = np.array([0, 10, 75, 20, 74, 100, 100, 100, 100, 100.0])
-    assert m.sample_efficiency(returns, 0.75, final=100) == (3, False)
-    assert m.sample_efficiency(returns, 0.751, final=100) == (6, False)
+    assert m.sample_efficiency(curve(returns, final=100)) == (3, False)
+    assert m.sample_efficiency(curve(returns, final=100, threshold=0.751)) == (6, False)
 
 
 def test_sample_efficiency_bar_of_negative_returns_lies_above_the_final_return():
     returns = np.array([-500.0, -200.0, *[-85.0] * 18])
-    assert m.sample_efficiency(returns, 0.75, final=-85) == (20, True)  # the bar is -63.75
+    assert m.sample_efficiency(curve(returns, final=-85)) == (20, True)  # the bar is -63.75
     returns[4] = -63.75
-    assert m.sample_efficiency(returns, 0.75, final=-85) == (5, False)
+    assert m.sample_efficiency(curve(returns, final=-85)) == (5, False)
+    # The last episode is not too late.
+    assert m.sample_efficiency(curve([0.0, 0.0, 1.0], final=1)) == (3, False)
 
 
-def test_reaching_the_bar_in_the_last_episode_is_not_censored():
-    assert m.sample_efficiency(np.array([0.0, 0.0, 1.0]), 0.75, final=1) == (3, False)
-
-
-# the paper's convergence
-
-
-def test_convergence_where_a_ramp_has_left_both_windows():
+def test_convergence_is_where_a_ramp_has_left_both_windows_and_not_the_flat_start():
     # Flat from episode 300 on: both windows of 50 are flat at episode 300 + 99.
-    assert m.convergence_steps(ramp(0, 300, 1700), 50) == (399, False)
-
-
-def test_convergence_is_not_the_flat_start():
-    # 200 + 100 episodes, then flat: convergence at 300 + 99; the literal reading takes the start.
-    curve = ramp(200, 100, 1000)
-    assert m.convergence_steps(curve, 50) == (399, False)
-    assert m.convergence_steps_flattest(curve, 50) == (100, False)
+    for flat_before in (0, 200):
+        rise = curve(ramp(flat_before, 300 - flat_before, 1000))
+        assert m.convergence_steps(rise) == (399, False)
+    assert m.convergence_steps_flattest(rise) == (100, False)  # the literal reading takes the start
 
 
 def test_convergence_at_the_first_peak_after_the_steepest_rise():
@@ -111,8 +126,8 @@ def test_convergence_at_the_first_peak_after_the_steepest_rise():
     slopes_by_hand = [0.5, 2.25, 4, 2.25, 0, -0.75, -0.25]  # t = 4, …, 10
     assert m.moving_average(returns, 2).tolist() == averages_by_hand
     assert m.slope(returns, 2).tolist() == slopes_by_hand
-    assert m.convergence_steps(returns, 2) == (8, False)
-    assert m.convergence_steps_flattest(returns, 2) == (8, False)
+    assert m.convergence_steps(curve(returns, moving_average=2)) == (8, False)
+    assert m.convergence_steps_flattest(curve(returns, moving_average=2)) == (8, False)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -120,12 +135,13 @@ def test_convergence_against_loops(seed):
     returns, window = noisy(seed), 25
     average = averages(returns, window)
     slopes = {t: average[t] - average[t - window] for t in average if t - window in average}
+    run = curve(returns, moving_average=window)
     slopes = {t: round(value, 9) for t, value in slopes.items()}
     steepest = max(slopes, key=lambda t: (slopes[t], -t))
     expected = next((t for t in slopes if t >= steepest and slopes[t] <= 0), None)
-    assert m.convergence_steps(returns, window) == (expected or 400, expected is None)
+    assert m.convergence_steps(run) == (expected or 400, expected is None)
     flattest = min(slopes, key=lambda t: (abs(slopes[t]), t))
-    assert m.convergence_steps_flattest(returns, window) == (flattest, False)
+    assert m.convergence_steps_flattest(run) == (flattest, False)
 
 
 @pytest.mark.parametrize(
@@ -141,20 +157,12 @@ def test_convergence_against_loops(seed):
     ids=["constant", "falling", "rising throughout", "two windows short", "one short", "one"],
 )
 def test_convergence_that_never_comes_is_censored(returns):
-    assert m.convergence_steps(returns, 50) == (len(returns), True)
+    assert m.convergence_steps(curve(returns)) == (len(returns), True)
 
 
 def test_flattest_needs_two_windows():
-    assert m.convergence_steps_flattest(np.ones(99), 50) == (99, True)
-    assert m.convergence_steps_flattest(np.ones(100), 50) == (100, False)
-
-
-# the public code's convergence
-
-
-def test_public_code_never_reports_less_than_its_floor():
-    assert m.convergence_steps_public_code(np.ones(2000)) == (586, False)
-    assert m.convergence_steps_public_code(np.ones(6000)) == (1786, False)
+    assert m.convergence_steps_flattest(curve(np.ones(99))) == (99, True)
+    assert m.convergence_steps_flattest(curve(np.ones(100))) == (100, False)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -166,31 +174,30 @@ def test_public_code_against_a_loop(seed):
         if abs(average[i + 50] - average[i]) / 50 < 0.05:
             expected = (i + 1, False)
             break
-    assert m.convergence_steps_public_code(returns) == expected
+    assert m.convergence_steps_public_code(curve(returns)) == expected
 
 
-def test_public_code_is_censored_while_the_return_changes():
-    assert m.convergence_steps_public_code(np.arange(2000.0)) == (2000, True)
-    assert m.convergence_steps_public_code(0.049 * np.arange(2000.0)) == (586, False)
-    assert m.convergence_steps_public_code(np.ones(60)) == (60, True)
-
-
-# the companions
+def test_public_code_has_a_floor_and_is_censored_while_the_return_changes():
+    assert m.convergence_steps_public_code(curve(np.ones(2000))) == (586, False)
+    assert m.convergence_steps_public_code(curve(np.ones(6000))) == (1786, False)
+    assert m.convergence_steps_public_code(curve(np.arange(2000.0))) == (2000, True)
+    assert m.convergence_steps_public_code(curve(0.049 * np.arange(2000.0))) == (586, False)
+    assert m.convergence_steps_public_code(curve(np.ones(60))) == (60, True)
 
 
 def test_range_bar_of_negative_returns():
     # From -500 to -100 with random -500: the bar is -200, 75 % of the way. Window 10: the average
     # of k episodes at -100 and 10 - k at -500 is -500 + 40 k, so 8 of them reach it (-180).
-    returns = np.array([-500.0] * 30 + [-100.0] * 70)
-    assert m.sample_efficiency_range(returns, 0.75, -100, 10, -500) == (38, False)
+    run = curve([-500.0] * 30 + [-100.0] * 70, -100, -500, moving_average=10)
+    assert m.sample_efficiency_range(run) == (38, False)
     # Within 10 % of 400 of the final return, so at -140 or above: 9 of 10 episodes (-140).
-    assert m.convergence_steps_range(returns, 0.1, -100, 10, -500) == (39, False)
+    assert m.convergence_steps_range(run) == (39, False)
 
 
 def test_one_lucky_episode_does_not_reach_the_range_bar():
-    returns = np.array([0.0] * 20 + [100.0] + [0.0] * 29 + [100.0] * 50)
-    assert m.sample_efficiency(returns, 0.75, 100) == (21, False)
-    assert m.sample_efficiency_range(returns, 0.75, 100, 10, 0) == (58, False)
+    run = curve([0.0] * 20 + [100.0] + [0.0] * 29 + [100.0] * 50, 100, 0, moving_average=10)
+    assert m.sample_efficiency(run) == (21, False)
+    assert m.sample_efficiency_range(run) == (58, False)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -200,37 +207,32 @@ def test_range_metrics_against_loops(seed):
     average = averages(returns, window)
     bar = random_mean + 0.75 * (final - random_mean)
     reached = next((t for t in average if average[t] >= bar), None)
-    observed = m.sample_efficiency_range(returns, 0.75, final, window, random_mean)
-    assert observed == (reached or 400, reached is None)
+    run = curve(returns, final, random_mean, moving_average=window)
+    assert m.sample_efficiency_range(run) == (reached or 400, reached is None)
     near = [t for t in average if abs(average[t] - final) <= 0.1 * (final - random_mean)]
     settled = [t for t in near if set(range(t, 401)) <= set(near)]
-    observed = m.convergence_steps_range(returns, 0.1, final, window, random_mean)
-    assert observed == ((min(settled), False) if settled else (400, True))
+    expected = (min(settled), False) if settled else (400, True)
+    assert m.convergence_steps_range(run) == expected
 
 
 def test_a_collapse_delays_the_convergence_without_floor():
-    returns = np.array([0.0] * 20 + [100.0] * 50 + [0.0] * 10 + [100.0] * 100)
+    returns = [0.0] * 20 + [100.0] * 50 + [0.0] * 10 + [100.0] * 100
     # Flat again once the window of 10 holds no collapsed episode (9 of 10 at 100 is 90: near).
-    assert m.convergence_steps_range(returns, 0.1, 100, 10, 0) == (89, False)
+    assert m.convergence_steps_range(curve(returns, 100, 0, moving_average=10)) == (89, False)
 
 
 @pytest.mark.parametrize("final", [-500.0, -499.1, -600.0])
 def test_a_run_no_better_than_random_reaches_nothing(final):
-    returns = np.full(200, final)
-    assert m.sample_efficiency_range(returns, 0.75, final, 50, -499.1) == (200, True)
-    assert m.convergence_steps_range(returns, 0.1, final, 50, -499.1) == (200, True)
-    # Final and random equal: the band has no width, and the average lies exactly within it.
-    assert m.convergence_steps_range(returns, 0.1, final, 50, final) == (200, True)
+    for random in (-499.1, final):  # equal: the band has no width, and the average is in it
+        run = curve(np.full(200, final), final, random)
+        assert m.sample_efficiency_range(run) == (200, True)
+        assert m.convergence_steps_range(run) == (200, True)
 
 
 def test_a_run_shorter_than_the_window_is_censored():
-    returns = np.full(20, 100.0)
-    assert m.sample_efficiency_range(returns, 0.75, 100, 50, 0) == (20, True)
-    assert m.convergence_steps_range(returns, 0.1, 100, 50, 0) == (20, True)
-
-
-def test_area_under_curve_is_the_mean_return():
-    assert m.area_under_curve(np.array([0.0, 1.0, 2.0, 5.0])) == 2
+    run = curve(np.full(20, 100.0), 100, 0)
+    assert m.sample_efficiency_range(run) == (20, True)
+    assert m.convergence_steps_range(run) == (20, True)
 
 
 def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
@@ -259,47 +261,19 @@ def table(**changed):
 
 def test_a_row_holds_each_metric_under_its_name():
     returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
-    row = m.metrics_of_run(frame(returns, 9), "CartPole-v1", "ppo", 4, CONFIG)
-    assert row == {
-        "env": "CartPole-v1",
-        "variant": "ppo",
-        "seed": 4,
-        "episodes": 1000,
-        "env_steps": 9000,
-        "final_return": 500.0,
-        "sample_efficiency": 201,
-        "convergence_steps": 300,  # both windows of 50 at 500: episodes 201 to 300
-        "area_under_curve": 404.0,
-        "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
-        "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
-        "convergence_steps_flattest": 100,
-        "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
-        "sample_efficiency_censored": 0,
-        "convergence_steps_censored": 0,
-        "sample_efficiency_range_censored": 0,
-        "convergence_steps_range_censored": 0,
-        "convergence_steps_flattest_censored": 0,
-        "convergence_steps_public_code_censored": 0,
-    }
-    assert list(row) == list(m.METRICS_COLUMNS)
+    row = m.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    assert row == ROW
+    assert list(row) == COLUMNS
 
 
 def test_the_table_is_in_the_configured_order_and_counts_censored_runs():
     result = table()
-    assert list(result.columns) == list(m.METRICS_COLUMNS)
     found = list(zip(result["env"], result["variant"], result["seed"], strict=True))
     assert found == list(product(ENVIRONMENTS, VARIANTS, SEEDS))
     assert not result.isna().any(axis=None)
     acrobot = result[result["env"] == "Acrobot-v1"]
     assert (acrobot["sample_efficiency_censored"] == 1).all()  # the bar is above the final return
     assert (acrobot["sample_efficiency"] == 400).all()
-
-
-def test_metrics_come_back_to_the_bit(tmp_path):
-    written = table()
-    written.to_csv(tmp_path / "metrics.csv", index=False)
-    read = m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS)
-    pd.testing.assert_frame_equal(read, written, check_exact=True)
 
 
 def test_a_missing_run_is_an_error_and_never_a_smaller_n():
@@ -315,16 +289,10 @@ def test_a_missing_run_is_an_error_and_never_a_smaller_n():
         table(runs=shorter)
 
 
-def test_an_environment_without_random_return_is_an_error_that_names_the_key():
-    with pytest.raises(ConfigError, match=r"'metrics\.random_return\.Pendulum-v1' is missing"):
-        m.random_return(CONFIG, "Pendulum-v1")
-    assert m.random_return(CONFIG, "CartPole-v1") == 22.1
-
-
 def change(row, column, value):
     def damage(lines):
         cells = lines[row].split(",")
-        cells[list(m.METRICS_COLUMNS).index(column)] = value
+        cells[COLUMNS.index(column)] = value
         lines[row] = ",".join(cells)
 
     return damage
@@ -354,33 +322,94 @@ def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
     spoil(lines)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordError, match=named) as refusal:
-        m.read_metrics(path, ENVIRONMENTS, VARIANTS, SEEDS)
+        m.read_metrics(path, ENVIRONMENTS, VARIANTS, SEEDS, CONFIG)
     assert str(path) in str(refusal.value)
 
 
+# metrics of the user's own
+
+
+@pytest.fixture
+def custom(monkeypatch):
+    """`custom(*metrics)`: the settings with these, as if this file were the user's."""
+
+    def make(*metrics):
+        names = [f"OWN_{number}" for number in range(len(metrics))]
+        for name, metric in zip(names, metrics, strict=True):
+            monkeypatch.setattr(sys.modules[__name__], name, metric, raising=False)
+        references = [f"{__name__}:{name}" for name in names]
+        return check(MetricsConfig, SETTINGS | {"custom": references}, "test")
+
+    return make
+
+
+def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
+    settings = custom(
+        m.Metric("positive", "Positive", "episodes", lambda curve: curve.first(curve.returns > 0)),
+        m.Metric("worst", "Worst", "return", lambda curve: curve.returns.min()),
+    )
+    result = table(settings=settings)
+    added = ["positive", "worst", "positive_censored"]
+    assert list(result.columns) == [*COLUMNS[:13], *added[:2], *COLUMNS[13:], added[2]]
+    pd.testing.assert_frame_equal(result[COLUMNS], table())
+    for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
+        returns = run["extrinsic_return"].tolist()
+        first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
+        assert tuple(row) == (first or 400, min(returns), first is None)
+    result.to_csv(tmp_path / "metrics.csv", index=False)
+    read = m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS, settings)
+    pd.testing.assert_frame_equal(read, result, check_exact=True)
+    with pytest.raises(RecordError, match="line 1: the column 'positive'"):
+        m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS, CONFIG)
+
+
 @pytest.mark.parametrize(
-    ("key", "value"),
+    ("own", "problem"),
     [
-        ("final_fraction", 0),
-        ("final_fraction", 1.1),
-        ("threshold", 1.0),
-        ("moving_average", 0),
-        ("moving_average", 50.5),
-        ("convergence_band", -0.1),
-        ("confidence", 95),
-        ("bootstrap_repetitions", 99),
-        ("bootstrap_seed", -1),
-        ("random_return", 22.1),
+        (3, "is no mace_rl.results.metrics.Metric but of type int"),
+        (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
+        (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
+        (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
+        (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
+        (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have episodes or"),
     ],
 )
-def test_a_setting_that_cannot_be_is_refused(key, value):
-    with pytest.raises(ConfigError, match=f"test: {key} is {value}"):
-        check(m.MetricsConfig, SETTINGS | {key: value}, "test")
+def test_what_is_no_metric_is_refused(own, problem, custom):
+    refusal = rf"metrics\.custom has '{__name__}:OWN_1', which .*{problem}"
+    with pytest.raises(ConfigError, match=refusal):
+        m.all_metrics(custom(m.Metric("x_censored", "X", "return", min), own))
 
 
-def test_random_returns_are_finite_numbers_and_unknown_keys_are_refused():
-    for value in (float("nan"), float("inf"), "22", True):
-        with pytest.raises(ConfigError, match=r"random_return\.CartPole-v1"):
-            check(m.MetricsConfig, SETTINGS | {"random_return": {"CartPole-v1": value}}, "test")
-    with pytest.raises(ConfigError, match="nearest known key is 'threshold'"):
-        check(m.MetricsConfig, SETTINGS | {"treshold": 0.5}, "test")
+@pytest.mark.parametrize(
+    ("unit", "value", "error", "problem"),
+    [
+        ("return", np.nan, ConfigError, "is nan, but should be a finite number"),
+        ("return", m.Episode(1, False), ConfigError, "but should be a finite number"),
+        ("episodes", 3.5, ConfigError, r"x of the run CartPole-v1, ppo, seed 3 is 3\.5, but"),
+        ("episodes", m.Episode(0, False), RecordError, "x is 0 of 400 episodes"),
+        ("episodes", m.Episode(9, True), RecordError, "x is 9 of 400 episodes with x_censored = 1"),
+    ],
+)
+def test_what_no_metric_can_be_is_refused(unit, value, error, problem, custom):
+    with pytest.raises(error, match=problem):
+        table(settings=custom(m.Metric("x", "X", unit, lambda curve: value)))
+
+
+REFUSED = {
+    "final_fraction": (0, 1.1),
+    "threshold": (1.0,),
+    "moving_average": (0, 50.5),
+    "convergence_band": (-0.1,),
+    "confidence": (95,),
+    "bootstrap_repetitions": (99,),
+    "bootstrap_seed": (-1,),
+    "random_return": (22.1, *({"CartPole-v1": value} for value in (np.nan, np.inf, "22", True))),
+    "custom": (["own_metrics.POSITIVE"], ["own metrics:POSITIVE"]),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_setting_that_cannot_be_is_refused(key):
+    for value in REFUSED[key]:
+        with pytest.raises(ConfigError, match=rf"test: {key}(\.CartPole-v1|\.0)? is "):
+            check(MetricsConfig, SETTINGS | {key: value}, "test")

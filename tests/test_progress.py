@@ -1,213 +1,309 @@
-"""The progress report, from fabricated run folders and with expected values by hand."""
+"""Progress and time left: by hand, against recorded trainings, and from Snakemake's messages."""
 
+import io
 import json
-import os
+import logging
+import math
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from rich.console import Console
+from snakemake_interface_logger_plugins.common import LogEvent
 
-from mace_rl import progress
-from mace_rl.progress import Progress, Run, Status, Watch, duration, seconds_left
+from mace_rl.runs import progress
+from mace_rl.runs.progress import Countdown, Pace, Run, duration, seconds_left
+from snakemake_logger_plugin_mace_rl import LogHandler, Study
 
-NOW = 1_000_000.0
-ALIVE, DEAD = 11, 22  # process numbers
-
-
-def make_run(
-    folder: Path,
-    env: str = "CartPole-v1",
-    variant: str = "ppo",
-    seed: int = 0,
-    episodes: int = 100,
-    due: bool = True,
-) -> Run:
-    directory = folder / env / variant / f"seed{seed}"
-    directory.mkdir(parents=True)
-    return Run(env, variant, seed, episodes, str(directory), due)
+nan = math.nan
 
 
-def made(episode: int, seconds: float, episodes: int = 100, **changes: float) -> Progress:
-    values = {"recent_return": 21.5, "steps_per_second": 1000.0, "time": NOW, "pid": ALIVE}
-    return Progress(episode=episode, episodes=episodes, seconds=seconds, **(values | changes))
+def reading(episode: int, seconds: float, episodes: int = 100) -> dict:
+    """What a run tells."""
+    told = {"env_steps": 20 * episode, "recent_return": 21.5, "beta": 0.25, "pid": 1}
+    return {"episode": episode, "episodes": episodes, "seconds": seconds} | told
 
 
-def write_progress(run: Run, found: Progress) -> None:
-    # Training writes one key more than the report reads.
-    content = vars(found) | {"env_steps": 12}
-    Path(run.directory, "progress.json").write_text(json.dumps(content))
+def paced(*readings: tuple[int, float]) -> Pace:
+    pace = Pace()
+    for episode, seconds in readings:
+        pace.add(reading(episode, seconds))
+    return pace
 
 
-def write_record(run: Run, seconds: float) -> None:
-    content = {"seconds": seconds, "config": {"episodes": run.episodes}, "versions": {}}
-    Path(run.directory, "run.json").write_text(json.dumps(content))
+def test_a_pace_is_that_of_the_second_half_so_far() -> None:
+    pace = paced((1, 30.0))  # with the compilation
+    assert math.isnan(pace.speed("episode")) and math.isnan(pace.left())
+    pace.add(reading(21, 40.0))
+    assert pace.speed("episode") == 2.0 and pace.speed("env_steps") == 40.0
+    assert math.isnan(pace.left())  # too early
+    pace.add(reading(41, 50.0))
+    assert pace.left() == (100 - 41) / 2.0
+    pace.add(reading(81, 60.0))
+    assert pace.speed("episode") == 60 / 20 and pace.seconds == 30.0
+    assert list(pace.cells().values()) == ["81/100", "21.5", "0.25", "60", "10 s"]
+    pace.add(reading(61, 70.0))  # it began again from a checkpoint
+    assert math.isnan(pace.left())
+    pace.add(reading(71, 80.0))
+    assert pace.left() == 29.0
 
 
-def watch(*runs: Run, local: bool = True) -> Watch:
-    return Watch(runs, local=local, started=NOW - 50, alive=lambda pid: pid == ALIVE)
+def run(seed: int, variant: str = "ppo", env: str = "CartPole-v1", work: float = 1.0) -> Run:
+    return Run(env, variant, str(seed), 100, work, "")
 
 
-def test_states_of_runs(tmp_path: Path) -> None:
-    done, running, waiting = (make_run(tmp_path, seed=seed) for seed in range(3))
-    other = make_run(tmp_path, seed=3, due=False)
-    write_record(other, 5.0)
-    watcher = watch(done, running, waiting, other)
-    assert watcher.status(NOW) == Status([], {}, [], [done, running, waiting])
-    write_progress(done, made(50, 1.0))
-    write_progress(running, made(50, 1.0))
-    assert set(watcher.status(NOW).running) == {done, running}
-    write_record(done, 2.0)
-    Path(done.directory, "progress.json").unlink()
-    assert watcher.status(NOW) == Status([done], {running: made(50, 1.0)}, [], [waiting])
-
-
-def test_record_of_an_earlier_training_is_not_done(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    write_record(run, 30.0)
-    watcher = watch(run)
-    assert watcher.status(NOW).waiting == [run]
-    assert watcher.rates() == {("CartPole-v1", "ppo"): 0.3}  # but it says how long one takes
-    record = Path(run.directory, "run.json")
-    record.unlink()  # as Snakemake does when it starts the job
-    assert watcher.status(NOW).waiting == [run]
-    write_record(run, 20.0)
-    os.utime(record, ns=(1, 1))  # certainly another time than before
-    assert watcher.status(NOW).done == [run]
-    assert watcher.rates() == {("CartPole-v1", "ppo"): 0.2}
-
-
-def test_left_behind_progress_is_not_running(tmp_path: Path) -> None:
-    killed, before, silent = (make_run(tmp_path, seed=seed) for seed in range(3))
-    write_progress(killed, made(50, 1.0, pid=DEAD, time=NOW - 49))
-    write_progress(before, made(50, 1.0, pid=DEAD, time=NOW - 51))  # before this workflow started
-    write_progress(silent, made(50, 1.0, time=NOW - 121))
-    assert watch(killed, before, silent).status(NOW) == Status([], {}, [killed], [before, silent])
-
-
-def test_process_numbers_of_other_machines_mean_nothing(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    write_progress(run, made(50, 1.0, pid=DEAD, time=NOW - 119))
-    assert list(watch(run, local=False).status(NOW).running) == [run]
-    assert watch(run, local=False).status(NOW + 2).waiting == [run]
-
-
-@pytest.mark.parametrize("content", [b"", b'{"episode": 5', b"[]", b"3", b"{}", b"\xff", b"null"])
-def test_unreadable_files_are_not_there_yet(tmp_path: Path, content: bytes) -> None:
-    run = make_run(tmp_path)
-    Path(run.directory, "progress.json").write_bytes(content)
-    assert watch(run).status(NOW).waiting == [run]
-    Path(run.directory, "run.json").write_bytes(content)
-    assert watch(run).rates() == {}
-
-
-GROUP = ("CartPole-v1", "ppo")
-
-
-def test_time_left_of_waiting_runs(tmp_path: Path) -> None:
-    # 0.3 s an episode: 30 s each and 5 s to start, on two cores.
-    runs = [make_run(tmp_path, seed=seed) for seed in range(3)]
-    status = Status([], {}, [], runs)
-    assert seconds_left(status, {GROUP: 0.3}, cores=2) == 70.0
-    assert seconds_left(status, {GROUP: 0.3}, cores=1) == 105.0
-    assert seconds_left(status, {GROUP: 0.3}, cores=3) == 35.0
-
-
-def test_longest_runs_first(tmp_path: Path) -> None:
-    # 100, 60, 50 s: [100 + 5] beside [60 + 5, 50 + 5]; shortest first, it would be 160 + 10.
-    runs = [make_run(tmp_path, variant=str(number), episodes=number) for number in (50, 100, 60)]
-    rates = {run.group: 1.0 for run in runs}
-    assert seconds_left(Status([], {}, [], runs), rates, cores=2) == 120.0
-
-
-def test_time_left_of_running_runs(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    # By itself: 20 of 100 episodes in 10 s, so 40 s more.
-    assert seconds_left(Status([], {run: made(20, 10.0)}, [], []), {}, cores=2) == 40.0
-    # Others took 100 s: a fifth of 50 s and four fifths of 100 s make 90 s, of which 10 are over.
-    status = Status([], {run: made(20, 10.0)}, [], [])
-    assert seconds_left(status, {GROUP: 1.0}, cores=2) == pytest.approx(80.0)
-    # Slower than expected, it is over soon and not before now.
-    status = Status([], {run: made(0, 200.0)}, [], [])
-    assert seconds_left(status, {GROUP: 1.0}, cores=2) == 0.0
-
-
-def test_waiting_runs_follow_running_ones(tmp_path: Path) -> None:
-    first, second = make_run(tmp_path), make_run(tmp_path, seed=1)
-    # 60 s and 90 s more on two cores; then 100 s and 5 s to start on the first of them.
-    progress = {first: made(40, 40.0), second: made(10, 10.0)}
-    third = make_run(tmp_path, seed=2)
-    assert seconds_left(Status([], progress, [], [third]), {}, cores=2) == pytest.approx(165.0)
-
-
-def test_groups_without_runs_borrow(tmp_path: Path) -> None:
-    acrobot = make_run(tmp_path, env="Acrobot-v1", episodes=200)
-    full = make_run(tmp_path, variant="mace_full", episodes=10)
-    rates = {GROUP: 1.0, ("CartPole-v1", "mace_fixed"): 3.0, ("Hopper", "ppo"): 5.0}
-    # The same environment: (1 + 3) / 2 s an episode.
-    assert seconds_left(Status([], {}, [], [full]), rates, cores=1) == 25.0
-    # All environments: (1 + 3 + 5) / 3 s an episode.
-    assert seconds_left(Status([], {}, [], [acrobot]), rates, cores=1) == 605.0
-
-
-def test_time_left_without_evidence(tmp_path: Path) -> None:
-    run = make_run(tmp_path)
-    assert seconds_left(Status([], {}, [], [run]), {}, cores=2) is None
-    assert seconds_left(Status([], {run: made(0, 0.1)}, [], []), {}, cores=2) is None
-    assert seconds_left(Status([run], {}, [], []), {}, cores=2) == 0.0
+A, B, C = (run(seed) for seed in range(3))
+FULL = run(1, "mace_full", work=3.0)
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"),
+    ("finished", "running", "waiting", "cores", "expected"),
     [
-        (0, "less than a minute"),
-        (59.9, "less than a minute"),
-        (61, "about 1 min"),
-        (59.4 * 60, "about 59 min"),
-        (59.6 * 60, "about 1 h 00 min"),
-        (3 * 3600 + 20 * 60 + 10, "about 3 h 20 min"),
-        (26 * 3600, "about 1 d 2 h"),
+        ({A: 30}, {}, [B, C], 2, 35),  # 30 s each and 5 s to start
+        ({A: 30}, {}, [B, C], 1, 70),
+        ({A: 20, B: 40}, {}, [C], 1, 35),
+        ({A: 30}, {}, [FULL], 1, 95),  # of another variant: by work
+        ({A: 30, FULL: 60}, {}, [run(2, "mace_full", work=3.0)], 1, 65),  # of its own
+        # The longest first: [100 + 5] beside [60 + 5, 50 + 5].
+        ({A: 1}, {}, [run(n, work=n) for n in (50, 100, 60)], 2, 120),
+        # By itself: 20 episodes took 10 s. As others: 80 s. A fifth of that is over.
+        ({}, {A: paced((20, 10.0), (40, 20.0))}, [], 2, 30),
+        ({B: 100}, {A: paced((20, 10.0), (40, 20.0))}, [], 2, 0.2 * 30 + 0.8 * 80),
+        ({B: 100}, {A: paced((10, 10.0))}, [], 2, 90),
+        ({B: 100}, {A: paced((10, 120.0))}, [], 2, 0),
+        ({B: 100}, {A: paced((10, 40.0))}, [C], 1, 60 + 105),
+        ({B: 100}, {A: paced((10, 40.0))}, [C], 2, 105),
+        ({}, {}, [], 2, nan),
+        ({}, {A: paced((10, 10.0))}, [], 2, nan),
+        ({}, {A: paced((20, 10.0), (40, 20.0))}, [B], 2, nan),
+        ({run(0, env="Acrobot-v1"): 9}, {}, [A], 2, nan),
     ],
 )
-def test_duration(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
+def test_seconds_left_by_hand(finished, running, waiting, cores, expected) -> None:
+    seconds, without = seconds_left(finished, running, waiting, cores, start=5.0)
+    assert seconds == pytest.approx(expected, nan_ok=True)
+    assert without == (["CartPole-v1"] if math.isnan(expected) and (running or waiting) else [])
 
 
-def test_report(tmp_path: Path) -> None:
-    runs = [make_run(tmp_path, seed=seed) for seed in range(4)]
-    hopper = make_run(tmp_path, "HopperBulletEnv-v0", "mace_full", 12, 6000)
-    running = {
-        hopper: made(1204, 900.0, 6000, recent_return=-612.34, steps_per_second=1830.4),
-        runs[0]: made(80, 9.0, recent_return=480.1, steps_per_second=11230.0),
-    }
-    lines = progress.report(Status(runs[1:2], running, runs[2:3], runs[3:]), 12000.0, NOW).split(
-        "\n"
-    )
-    assert lines[0].endswith(
-        "] 1 of 5 runs done, 2 running, 1 stopped, 1 waiting; about 3 h 20 min left"
-    )
-    assert [" ".join(line.split()) for line in lines[1:]] == [
-        "HopperBulletEnv-v0 mace_full seed 12 episode 1204/6000 return -612.3 1830 steps/s",
-        "CartPole-v1 ppo seed 0 episode 80/100 return 480.1 11230 steps/s",
+def test_environments_that_nothing_is_known_of_are_left_out() -> None:
+    waiting = [B, run(0, env="Hopper"), run(0, env="Acrobot-v1")]
+    assert seconds_left({A: 30}, {}, waiting, 2, 5.0) == (35, ["Acrobot-v1", "Hopper"])
+
+
+# The part of its steps that a recorded training had done after these parts of its episodes: at the
+# paper's budgets; Hopper's at a twelfth of it, where episodes grow to the very end.
+EPISODES = [0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1]
+STEPS = {
+    "Hopper": [0, 0.002, 0.007, 0.015, 0.031, 0.048, 0.121, 0.315, 1],
+    "CartPole-v1": [0, 0.001, 0.009, 0.039, 0.141, 0.248, 0.463, 0.733, 1],
+    "Acrobot-v1": [0, 0.097, 0.154, 0.225, 0.330, 0.418, 0.586, 0.791, 1],
+}
+
+
+class Training:
+    """One that takes so many seconds, and 20 more if the first episode has to compile its code."""
+
+    def __init__(self, run: Run, seconds: float, compiles: bool) -> None:
+        parts = np.interp(np.arange(run.episodes + 1) / run.episodes, EPISODES, STEPS[run.env])
+        self.run = run
+        self.ends = seconds * parts + 20.0 * compiles  # of its episodes
+        self.total = float(self.ends[-1])
+
+    def reading(self, seconds: float) -> dict | None:
+        """What it tells, every two seconds."""
+        done = int(np.searchsorted(self.ends[1:], seconds // 2 * 2, side="right"))
+        return reading(done, float(self.ends[done]), self.run.episodes) if done else None
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Acrobot-v1"])
+def test_time_left_of_one_recorded_run(env: str) -> None:
+    training = Training(Run(env, "ppo", "0", 2000, 1.0, ""), 60.0, compiles=True)
+    pace, countdown, factors = Pace(), Countdown(), []
+    for now in np.arange(0, training.total - 5, 0.5):
+        pace.add(training.reading(now))
+        left = countdown.show(pace.left() if pace.readings else nan, now)
+        factors.append(left / (training.total - now))
+    assert np.isfinite(factors).mean() > 0.3
+    assert np.nanmin(factors) > 0.7 and np.nanmax(factors) < 1.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_time_left_of_a_study_of_recorded_runs(seed: int) -> None:
+    """Once shown it is within a factor of 2 of the truth, and moves by 10 % a second at most."""
+    random = np.random.default_rng(seed)
+    budgets = {"Hopper": (500, 90.0), "CartPole-v1": (2000, 60.0), "Acrobot-v1": (2000, 30.0)}
+    variants = {"mace_full": (2.0, 2.4), "mace_fixed": (2.0, 1.6), "ppo": (1.0, 1.0)}
+    queue = [
+        Training(
+            Run(env, variant, str(seed), budgets[env][0], variants[variant][0], ""),
+            budgets[env][1] * variants[variant][1] * random.uniform(0.7, 1.4),
+            compiles=seed == 0,
+        )
+        for env, variant, seed in product(budgets, variants, range(3))
     ]
-    columns = [[line.index(word) for word in ("seed", "episode", "return")] for line in lines[1:]]
-    assert columns[0] == columns[1]
-    assert "not known yet" in progress.report(Status([], {}, [], runs), None, NOW)
+    start, starts, begun, finished, factors, moves = 6.0, [5.0], {}, {}, [], []
+    without, last = None, nan
+    for now in range(10_000):
+        for training, (time, pace) in list(begun.items()):
+            pace.add(training.reading(now - time - start))
+            if now >= time + start + training.total:
+                finished[training.run] = training.total - pace.start_seconds
+                starts.append(start + pace.start_seconds)
+                del begun[training]
+        while queue and len(begun) < 2:
+            begun[queue.pop(0)] = now, Pace()
+        if not begun:
+            break
+        running = {training.run: pace for training, (_, pace) in begun.items() if pace.readings}
+        waiting = [t.run for t in [*begun, *queue] if t.run not in running]
+        before = without
+        estimate, without = seconds_left(finished, running, waiting, 2, np.mean(starts))
+        if without != before:
+            countdown, last = Countdown(), nan
+        shown = countdown.show(estimate, now)
+        if last > 20:
+            moves.append(shown / (last - 1))
+        last = shown
+        ends = [
+            time + start + t.total for t, (time, _) in begun.items() if t.run.env not in without
+        ]
+        ends += [now] * (2 - len(ends))
+        for training in queue:
+            if training.run.env not in without:
+                ends[ends.index(min(ends))] += start + training.total
+        if max(ends) - now > 20:
+            factors.append(shown / (max(ends) - now))
+    assert np.isfinite(factors).sum() > 0.6 * now
+    assert np.nanmin(factors) > 0.5 and np.nanmax(factors) < 2
+    assert np.nanmin(moves) > 0.9 and np.nanmax(moves) < 1.1
 
 
-def test_monitor_ends_when_all_is_done_or_its_parent_is_gone(tmp_path: Path) -> None:
-    run = make_run(tmp_path, due=False)
-    code = (
-        "import sys; from mace_rl import progress; from mace_rl.progress import Run;"
-        f"monitor = progress.start([{run!r}], 2, True); progress.stop(monitor)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (0, "")
-    assert done.stderr.endswith("] 0 of 0 runs done\n")
-    # The parent dies without a word: the pipe that the monitor listens to is closed all the same.
-    due = make_run(tmp_path, seed=1)
-    code = code.replace(repr(run), repr(due)).replace(
-        "progress.stop(monitor)", "import os; os._exit(9)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.stderr.endswith("] 0 of 1 runs done, 1 waiting\n")
+def test_a_countdown_ticks_and_follows_slowly() -> None:
+    countdown = Countdown()
+    assert math.isnan(countdown.show(nan, 0.0))
+    assert countdown.show(100.0, 7.0) == 100.0
+    assert countdown.show(90.0, 17.0) == pytest.approx(90.0)
+    assert 89.0 < countdown.show(400.0, 18.0) < 110.0
+    assert countdown.show(400.0, 118.0) > 350.0
+    assert math.isnan(countdown.show(nan, 119.0))
+
+
+def test_durations_in_words() -> None:
+    seconds = [nan, 0, 41, 59.9, 570, 10.4 * 60, 59.6 * 60, 3 * 3600 + 1210]
+    words = ["", "10 s", "50 s", "1 min 00 s", "9 min 30 s", "10 min", "1 h 00 min", "3 h 20 min"]
+    assert [duration(value) for value in seconds] == words
+
+
+def test_in_place_on_a_terminal_and_seldom_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setenv("TERM", "xterm")
+    file, terminal = io.StringIO(), io.StringIO()
+    terminal.isatty = lambda: True
+    for stream in (file, terminal):
+        now[0] = 0.0
+        with progress.line(stream) as show:
+            for second in range(61):
+                now[0] = float(second)
+                show(reading(second + 1, second))
+    first, second = file.getvalue().splitlines()
+    assert first == "episode 6/100   return 21.5   β 0.25   steps/s 20"
+    assert second == "episode 36/100   return 21.5   β 0.25   steps/s 20   left 1 min 10 s"
+    assert all(f"episode {number}/100" in terminal.getvalue() for number in range(1, 62))
+
+
+@pytest.fixture
+def handler(monkeypatch: pytest.MonkeyPatch) -> LogHandler:
+    """What Snakemake hands its messages to; it writes into a string."""
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    return LogHandler(SimpleNamespace(stdout=False, dryrun=False, quiet=None), None)
+
+
+def tell(handler: LogHandler, message: str = "", level: int = logging.INFO, **extra) -> None:
+    record = logging.LogRecord("snakemake", level, "", 0, message, None, None)
+    vars(record).update(extra)
+    handler.handle(record)
+
+
+def begin(handler: LogHandler, job: int, *wildcards: str, rule: str = "train", log="none") -> None:
+    names = dict(zip(("env", "variant", "seed"), wildcards, strict=False))
+    said = {"jobid": job, "rule_name": rule, "wildcards": names, "log": [str(log)]}
+    tell(handler, event=LogEvent.JOB_INFO, **said)
+
+
+def shown(study: Study) -> list[str]:
+    console = Console(file=io.StringIO(), width=100)
+    console.print(study.table(0.0))
+    return [" ".join(line.split()[1:]) for line in console.file.getvalue().splitlines()]
+
+
+def test_what_a_study_shows(tmp_path: Path, handler: LogHandler) -> None:
+    runs = [run(seed)._replace(folder=str(tmp_path / f"{seed}")) for seed in range(5)]
+    told = [tmp_path / f"{seed}" / "progress.json" for seed in range(5)]
+    done = [tmp_path / f"{seed}" / "run.json" for seed in range(5)]
+    for path, stale in zip(told, ["[", json.dumps(reading(99, 99.0)), "{}", "", ""], strict=True):
+        path.parent.mkdir()
+        path.write_text(stale)
+    for path, content in zip(done, ["{", "[]", "{}", '{"config": 3}'], strict=False):
+        path.write_text(content)
+    record = {"seconds": 60.0, "config": {"episodes": 100}}
+    done[4].write_text(json.dumps(record))  # not due
+    study = Study(runs, [run[:3] for run in runs[:4]], cores=2)
+    assert shown(study) == ["0 of 4 runs done, 4 waiting; about 2 min 10 s left"]
+    tell(handler, "4 runs", study=study)
+    begin(handler, 0, *runs[0][:3])
+    begin(handler, 1, *runs[1][:3])
+    assert shown(study)[0].startswith("0 of 4 runs done, 2 starting, 2 waiting; about")
+    told[1].write_text(json.dumps(reading(1, 30.0)))
+    shown(study)
+    told[1].write_text(json.dumps(reading(50, 60.0)))
+    heading, names, row = shown(study)
+    assert heading.startswith("0 of 4 runs done, 1 running, 1 starting, 2 waiting; about")
+    assert names == "variant seed episode return β steps/s left"
+    assert row == "ppo 1 50/100 21.5 0.25 33 40 s"
+    done[1].write_text(json.dumps(record | {"seconds": 100.0}))  # 30 of it for the compilation
+    tell(handler, event=LogEvent.JOB_FINISHED, job_id=1)
+    assert study.finished == {runs[4]: 60.0, runs[1]: 70.0}
+    log = tmp_path / "a.log"
+    log.write_text("2026-01-01 12:00:00,000 training A failed: No: reason\nTraceback\nNo: reason\n")
+    begin(handler, 2, *runs[2][:3], log=log)
+    tell(handler, "Twenty lines", logging.ERROR, event=LogEvent.JOB_ERROR, jobid=2)
+    tell(handler, event=LogEvent.JOB_ERROR, jobid=0)  # there is no log
+    log.write_text("training A: interrupted\n")
+    begin(handler, 3, *runs[3][:3], log=log)
+    tell(handler, event=LogEvent.JOB_ERROR, jobid=3)
+    begin(handler, 9, rule="metrics")
+    tell(handler, event=LogEvent.JOB_FINISHED, job_id=9)
+    ending = "1 of 4 runs done, 2 failed, 1 interrupted"
+    assert shown(study) == [f"{ending}; tables and figures follow"]
+    tell(handler, "RuleException: ... returned non-zero exit status 1.", logging.ERROR)
+    tell(handler, "The disk is full", logging.ERROR)
+    handler.close()
+    *lines, last = handler.display.console.file.getvalue().splitlines()
+    assert lines == [
+        "4 runs",
+        f"training A failed: No: reason (more in {log})",
+        "train CartPole-v1 ppo 0 failed: it ended without a word (more in none)",
+        "The disk is full",
+    ]
+    assert last.endswith(f"] {ending}")
+
+
+def test_runs_on_other_machines(tmp_path: Path, handler: LogHandler) -> None:
+    far = A._replace(folder=str(tmp_path))
+    study = Study([far], [far[:3]], cores=None)
+    tell(handler, study=study)
+    begin(handler, 7, *far[:3])
+    assert shown(study) == ["0 of 1 runs done, 1 submitted; time left not known yet"]
+    (tmp_path / "progress.json").write_text(json.dumps(reading(40, 60.0)))
+    assert shown(study)[0] == "0 of 1 runs done, 1 running; time left not known yet"
+    handler.close()
+
+
+def test_jobs_do_without_what_draws() -> None:
+    code = "import sys, mace_rl.runs.run, mace_rl.runs.progress; sys.exit('rich' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

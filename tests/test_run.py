@@ -3,6 +3,7 @@
 import ast
 import fcntl
 import hashlib
+import itertools
 import json
 import logging
 import os
@@ -17,20 +18,24 @@ from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete
+from shared import LAYER_NORM, VARIANTS, Bonanza, finish
 
-from mace_rl import checkpoint, provenance, run, sources
+from mace_rl import sources
+from mace_rl.config.reading import merge
+from mace_rl.config.run import RunConfig
 from mace_rl.finite import NonFiniteError
-from mace_rl.hyperparameters import RunConfig
-from mace_rl.records import read_episodes
-from mace_rl.study import merge
+from mace_rl.results.records import read_episodes
+from mace_rl.runs import checkpoint, provenance, run
+from mace_rl.runs.agent import load_agent
+from mace_rl.runs.evaluate import evaluate
 from mace_rl.train import Trainer
 
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
-VARIANTS = ["ppo", "mace_fixed", "mace_full"]
-RESULTS = ["agent.pt", "episodes.csv", "run.json"]
+OUTCOME = ["agent.pt", "diagnostics.csv", "episodes.csv"]
+RESULTS = [*OUTCOME, "run.json"]
 UNFINISHED = ["checkpoint.pt", "progress.json"]
 
 
@@ -40,18 +45,21 @@ class Killed(BaseException):
 
 @pytest.fixture
 def kill(monkeypatch):
-    """`kill(episode)`: the next run dies in the update after this episode; None: it does not."""
+    """`kill(update, config, directory)`: carry out a run that dies in this update."""
     improve = Trainer.improve
 
-    def arm(episode: int | None) -> None:
-        def improve_or_die(self, rollout) -> None:
-            if len(self.records) == episode:
+    def start(number: int, config: RunConfig, directory: Path) -> None:
+        def improve_or_die(self, rollout):
+            if len(self.diagnostics) == number - 1:
                 raise Killed
-            improve(self, rollout)
+            return improve(self, rollout)
 
-        monkeypatch.setattr(Trainer, "improve", improve_or_die)
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "improve", improve_or_die)
+            with pytest.raises(Killed):
+                run.run(config, directory)
 
-    return arm
+    return start
 
 
 @pytest.fixture
@@ -59,13 +67,8 @@ def checkpoint_every(monkeypatch):
     """`checkpoint_every(n)`: a checkpoint after every n-th round instead of by time."""
 
     def arrange(rounds: int) -> None:
-        asked = [0]
-
-        def due(self) -> bool:
-            asked[0] += 1
-            return asked[0] % rounds == 0
-
-        monkeypatch.setattr(run.Clock, "checkpoint_due", due)
+        asked = itertools.count(1)
+        monkeypatch.setattr(run.Clock, "checkpoint_due", lambda self: next(asked) % rounds == 0)
 
     return arrange
 
@@ -74,10 +77,23 @@ def files(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 
-def outcome(directory: Path) -> tuple[bytes, bytes]:
-    """The bytes that must not depend on interruptions."""
-    assert files(directory) == RESULTS
-    return (directory / "episodes.csv").read_bytes(), (directory / "agent.pt").read_bytes()
+@pytest.fixture
+def completes(tmp_path):
+    """`completes(config, directory)`: carry it to its end, which is that of a run never disturbed.
+
+    Bytes are compared of all that must not depend on interruptions. Returns what run.json tells.
+    """
+
+    def carry_on(config: RunConfig, directory: Path) -> dict:
+        outcomes = []
+        for folder in (directory, tmp_path / "whole"):
+            run.run(config, folder)
+            assert files(folder) == RESULTS
+            outcomes.append([(folder / name).read_bytes() for name in OUTCOME])
+        assert outcomes[0] == outcomes[1]
+        return provenance_of(directory)
+
+    return carry_on
 
 
 def provenance_of(directory: Path) -> dict:
@@ -87,63 +103,55 @@ def provenance_of(directory: Path) -> dict:
 # --- Interrupted and resumed --------------------------------------------------------------------
 
 
-@pytest.mark.slow
+SEVERAL = {"rollout_steps": 80, "minibatch_size": 16, "normalise_observations": True}
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize(
+    ("environment", "changes"),
+    [
+        ("CartPole-v1", {}),
+        ("Acrobot-v1", {}),
+        ("HopperBulletEnv-v0", {}),
+        ("CartPole-v1", {"ppo": SEVERAL}),
+        ("CartPole-v1", {"ppo": SEVERAL, "engine": "torch"}),
+        ("CartPole-v1", {"ppo": SEVERAL | {"network": LAYER_NORM}}),
+    ],
+    ids=[*ENVIRONMENTS, "several", "torch", "LayerNorm"],
+)
 def test_resumed_run_equals_uninterrupted_run(
-    run_config, tmp_path, kill, checkpoint_every, environment, variant
+    run_config, tmp_path, kill, checkpoint_every, completes, environment, changes, variant
 ):
     """Killed twice, between checkpoints, so that lost rounds are played again."""
-    config = run_config(environment, variant, 4, episodes=11)
-    run.run(config, tmp_path / "whole")
-    checkpoint_every(3)
-    for episode in (5, 10):
-        kill(episode)
-        with pytest.raises(Killed):
-            run.run(config, tmp_path / "killed")
+    config = run_config(environment, variant, 4, episodes=30 if changes else 8, **changes)
+    checkpoint_every(2)
+    for update in (4, 7):
+        kill(update, config, tmp_path / "killed")
         assert files(tmp_path / "killed") == UNFINISHED
-    kill(None)
-    run.run(config, tmp_path / "killed")
-    assert outcome(tmp_path / "killed") == outcome(tmp_path / "whole")
-    interruptions = provenance_of(tmp_path / "killed")["interruptions"]
+    interruptions = completes(config, tmp_path / "killed")["interruptions"]
     # Resumed where the last checkpoint before the kill was.
-    assert [item["after_episode"] for item in interruptions] == [3, 8]
+    updates = finish(config).diagnostics
+    found = [item["after_episode"] for item in interruptions]
+    assert found == [updates[1].episode, updates[4].episode]
     assert all(item["machine"]["cpu"] for item in interruptions)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_resumed_run_with_rollouts_of_several_episodes(
-    run_config, tmp_path, kill, checkpoint_every, variant
-):
-    settings = {"rollout_steps": 80, "minibatch_size": 16, "normalise_observations": True}
-    config = run_config("CartPole-v1", variant, 4, episodes=20, ppo=settings)
-    run.run(config, tmp_path / "whole")
-    checkpoint_every(1)
-    rounds = [records[-1].episode for records in Trainer(config).run()]
-    assert len(rounds) < 10
-    kill(rounds[3])
-    with pytest.raises(Killed):
-        run.run(config, tmp_path / "killed")
-    kill(None)
-    run.run(config, tmp_path / "killed")
-    assert outcome(tmp_path / "killed") == outcome(tmp_path / "whole")
 
 
 CHILD = """
 import sys, time
 from pathlib import Path
-from mace_rl import run
-from mace_rl.hyperparameters import RunConfig
+from mace_rl.runs import run
+from mace_rl.config.run import RunConfig
 from mace_rl.train import Trainer
 
 run.CHECKPOINT_SECONDS, run.CHECKPOINT_COST = 0, float("inf")
 improve = Trainer.improve
 
 def improve_until_12(self, rollout):
-    improve(self, rollout)
+    update = improve(self, rollout)
     if len(self.records) == 12:
         print("ready", flush=True)
         time.sleep(600)
+    return update
 
 Trainer.improve = improve_until_12
 run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
@@ -152,7 +160,7 @@ run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
 
 @pytest.mark.slow
 def test_a_process_killed_by_sigkill_is_resumed_by_another(
-    run_config, tmp_path, monkeypatch, caplog
+    run_config, tmp_path, monkeypatch, caplog, completes
 ):
     """And while it lives, a second process in its folder is refused."""
     monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)
@@ -171,28 +179,21 @@ def test_a_process_killed_by_sigkill_is_resumed_by_another(
             process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
     with caplog.at_level(logging.INFO):
-        run.run(config, directory)
+        assert len(completes(config, directory)["interruptions"]) == 1
     assert "resuming after episode 11" in caplog.text
-    run.run(config, tmp_path / "whole")
-    assert outcome(directory) == outcome(tmp_path / "whole")
-    assert len(provenance_of(directory)["interruptions"]) == 1
 
 
 COUNT_THREADS = """
 import sys
 from pathlib import Path
 from threadpoolctl import threadpool_info
-from mace_rl import run
-from mace_rl.hyperparameters import RunConfig
-from mace_rl.train import Trainer
+from mace_rl.runs import run
+from mace_rl.config.run import RunConfig
 
-class Watched(Trainer):
-    def run(self):
-        yield from super().run()
-        print({library["filepath"]: library["num_threads"] for library in threadpool_info()})
+def observe(progress):
+    print({library["filepath"]: library["num_threads"] for library in threadpool_info()})
 
-run.Trainer = Watched
-run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
+run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), observe)
 """
 
 
@@ -206,7 +207,7 @@ def test_a_run_uses_one_thread(run_config, tmp_path):
         text=True,
         check=True,
     )
-    threads = ast.literal_eval(done.stdout)
+    threads = ast.literal_eval(done.stdout.splitlines()[-1])
     assert any("scipy" in Path(library).parent.name for library in threads)
     assert any("numpy" in Path(library).parent.name for library in threads)
     assert set(threads.values()) == {1}
@@ -224,48 +225,43 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
     timer.join()
 
 
-def test_killed_before_the_results_are_complete(run_config, tmp_path, monkeypatch):
-    """All episodes played, one result written: what is missing is made from the checkpoint."""
+def test_killed_before_the_results_are_complete(
+    run_config, tmp_path, monkeypatch, checkpoint_every, completes
+):
+    """All episodes played, some results written: what is missing is made from the checkpoint."""
     config = run_config("CartPole-v1", "mace_full", 0, episodes=6)
-    run.run(config, tmp_path / "whole")
-    monkeypatch.setattr(run.Clock, "checkpoint_due", lambda self: True)
+    checkpoint_every(1)
 
     def die(*_) -> None:
         raise Killed
 
-    with monkeypatch.context() as patched:
+    with monkeypatch.context() as patched, pytest.raises(Killed):
         patched.setattr(provenance, "git_state", die)
-        with pytest.raises(Killed):
-            run.run(config, tmp_path / "killed")
-    assert files(tmp_path / "killed") == sorted([*UNFINISHED, "agent.pt", "episodes.csv"])
+        run.run(config, tmp_path / "killed")
+    assert files(tmp_path / "killed") == sorted([*UNFINISHED, *OUTCOME])
     (tmp_path / "killed" / "agent.pt").unlink()  # as Snakemake does with outputs
-    run.run(config, tmp_path / "killed")
-    assert outcome(tmp_path / "killed") == outcome(tmp_path / "whole")
+    completes(config, tmp_path / "killed")
 
 
-def test_killed_while_writing_a_checkpoint(run_config, tmp_path, monkeypatch):
+def test_killed_while_writing_a_checkpoint(
+    run_config, tmp_path, monkeypatch, checkpoint_every, completes
+):
     """The one before is whole, and is what the run continues from."""
     config = run_config("CartPole-v1", "mace_fixed", 0, episodes=9)
-    run.run(config, tmp_path / "whole")
-    monkeypatch.setattr(run.Clock, "checkpoint_due", lambda self: True)
-    replaced = [0]
-    replace = os.replace
+    checkpoint_every(1)
+    replaced, replace = itertools.count(1), os.replace
 
     def replace_or_die(source, target) -> None:
-        if Path(target).name == "checkpoint.pt":
-            replaced[0] += 1
-            if replaced[0] == 5:
-                raise Killed
+        if Path(target).name == "checkpoint.pt" and next(replaced) == 5:
+            raise Killed
         replace(source, target)
 
-    with monkeypatch.context() as patched:
+    with monkeypatch.context() as patched, pytest.raises(Killed):
         patched.setattr(os, "replace", replace_or_die)
-        with pytest.raises(Killed):
-            run.run(config, tmp_path / "killed")
+        run.run(config, tmp_path / "killed")
     assert files(tmp_path / "killed") == UNFINISHED
-    run.run(config, tmp_path / "killed")
-    assert outcome(tmp_path / "killed") == outcome(tmp_path / "whole")
-    assert len(provenance_of(tmp_path / "killed")["interruptions"]) == 1
+    (interruption,) = completes(config, tmp_path / "killed")["interruptions"]
+    assert interruption["after_episode"] == 4
 
 
 def test_what_a_killed_process_had_half_written_goes(run_config, tmp_path):
@@ -283,10 +279,7 @@ def interrupted(run_config, tmp_path, kill, checkpoint_every):
     """A run of CartPole-v1, killed after a checkpoint: its configuration and folder."""
     config = run_config("CartPole-v1", "mace_full", 0, episodes=6)
     checkpoint_every(1)
-    kill(5)
-    with pytest.raises(Killed):
-        run.run(config, tmp_path / "run")
-    kill(None)
+    kill(5, config, tmp_path / "run")
     return SimpleNamespace(config=config, directory=tmp_path / "run")
 
 
@@ -307,14 +300,11 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_checkpoint_is_not_continued(interrupted, tmp_path, caplog, damage):
+def test_damaged_checkpoint_is_not_continued(interrupted, completes, caplog, damage):
     path = interrupted.directory / "checkpoint.pt"
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    run.run(interrupted.config, interrupted.directory)
+    assert completes(interrupted.config, interrupted.directory)["interruptions"] == []
     assert f"starting afresh: {path}: cut off or altered" in caplog.text
-    run.run(interrupted.config, tmp_path / "whole")
-    assert outcome(interrupted.directory) == outcome(tmp_path / "whole")
-    assert provenance_of(interrupted.directory)["interruptions"] == []
 
 
 @pytest.mark.parametrize(
@@ -330,46 +320,46 @@ def test_damaged_checkpoint_is_not_continued(interrupted, tmp_path, caplog, dama
     ],
 )
 def test_checkpoint_of_another_configuration_is_not_continued(
-    interrupted, tmp_path, caplog, changes, message
+    interrupted, completes, caplog, changes, message
 ):
-    settings = merge(interrupted.config.model_dump(), changes, whole={"beta"})
-    config = RunConfig.model_validate(settings)
-    run.run(config, interrupted.directory)
+    settings = merge(interrupted.config.settings(), changes, whole={"beta"})
+    completes(RunConfig.model_validate(settings), interrupted.directory)
     assert f"of another run: {message}" in caplog.text
-    run.run(config, tmp_path / "whole")
-    assert outcome(interrupted.directory) == outcome(tmp_path / "whole")
 
 
 def test_checkpoint_of_other_versions_or_code_is_not_continued(
     interrupted, monkeypatch, caplog, kill
 ):
     found = provenance.versions()
-    kill(1)  # before the first checkpoint, so the old one stays
-    with monkeypatch.context() as patched:
-        patched.setattr(provenance, "versions", lambda: found | {"torch": "9.9"})
-        with pytest.raises(Killed):
-            run.run(interrupted.config, interrupted.directory)
-    assert f"versions.torch was {found['torch']!r} and is '9.9'" in caplog.text
-    with monkeypatch.context() as patched:
-        patched.setattr(sources, "digest", lambda path: "0" * 64)
-        with pytest.raises(Killed):
-            run.run(interrupted.config, interrupted.directory)
-    assert "sources was" in caplog.text
+    for place, name, replaced, message in (
+        (provenance, "versions", lambda: found | {"torch": "9.9"}, "versions.torch was "),
+        (sources, "digest", lambda *paths: "0" * 64, "sources was "),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, replaced)
+            # Before the first checkpoint, so the old one stays.
+            kill(1, interrupted.config, interrupted.directory)
+        assert message in caplog.text
     caplog.clear()
-    kill(None)
     run.run(interrupted.config, interrupted.directory)
     assert "afresh" not in caplog.text
 
 
-def test_identity_covers_every_module_that_training_imports():
-    """A change in any of them changes the digest, so the checkpoint is of another code."""
-    script = "import sys, mace_rl.run; print(*(m for m in sys.modules if m.startswith('mace_rl.')))"
-    listed = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    ).stdout
-    imported = {f"{name.removeprefix('mace_rl.')}.py" for name in listed.split()}
-    covered = {path.name for path in sources.sources(sources.PACKAGE / "run.py")}
-    assert {"train.py", "ppo.py", "run.py"} <= imported <= covered
+def test_identity_covers_every_module_that_training_imports(run_config, monkeypatch):
+    """A change in any of them, or in the user's own, makes the checkpoint one of another code."""
+    script = (
+        "import sys, mace_rl.runs.run\n"
+        "for name, module in sys.modules.items():\n"
+        "    if name.partition('.')[0] == 'mace_rl': print(module.__file__)"
+    )
+    command = [sys.executable, "-c", script]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    imported = {Path(line) for line in listed.split()}
+    assert {path.name for path in imported} >= {"train.py", "ppo.py", "run.py", "__init__.py"}
+    covered, read = set(), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: (covered.add(path), read(path))[1])
+    run.run_identity(run_config(ppo={"network": LAYER_NORM}))
+    assert imported | {Path(__file__).with_name("shared.py")} <= covered
 
 
 class Payload:
@@ -401,42 +391,19 @@ def test_loading_executes_nothing(interrupted, tmp_path, caplog, writer):
 # --- Numbers that go bad ------------------------------------------------------------------------
 
 
-class Faulty(gymnasium.Env):
-    """Pays NaN in the third step once 20 steps were made, if it is broken."""
-
-    observation_space, action_space = Box(-1, 1, (2,), np.float32), Discrete(2)
-
-    def __init__(self, broken: bool) -> None:
-        self.broken, self.total = broken, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        self.steps, self.total = self.steps + 1, self.total + 1
-        reward = np.nan if self.broken and self.total > 20 and self.steps == 3 else 1.0
-        return self.np_random.random(2).astype(np.float32), reward, False, False, {}
-
-
 def test_nan_stops_the_run_and_keeps_the_last_checkpoint(
-    run_config, register, tmp_path, checkpoint_every, caplog
+    run_config, register, tmp_path, checkpoint_every, completes, caplog
 ):
-    name = register("Faulty-v0", Faulty, 6, broken=True)
+    name = register("Bonanza-v0", Bonanza, 6, where="reward", value=np.nan)
     config = run_config(name, "mace_full", 3, episodes=9)
     checkpoint_every(1)
-    with pytest.raises(NonFiniteError) as caught:
+    place = "^Bonanza-v0 mace_full seed 3, episode 4: the reward is nan after step 3$"
+    with pytest.raises(NonFiniteError, match=place):
         run.run(config, tmp_path / "run")
-    place = "Faulty-v0 mace_full seed 3, episode 4: the reward is nan after step 3"
-    assert str(caught.value) == place
     assert files(tmp_path / "run") == UNFINISHED
-    register("Faulty-v0", Faulty, 6, broken=False)  # whatever it was is repaired
-    with caplog.at_level(logging.INFO):
-        run.run(config, tmp_path / "run")
-    assert "resuming after episode 3" in caplog.text
-    run.run(config, tmp_path / "whole")
-    assert outcome(tmp_path / "run") == outcome(tmp_path / "whole")
+    register("Bonanza-v0", Bonanza, 6, where="reward", value=0.0)  # whatever it was is repaired
+    (interruption,) = completes(config, tmp_path / "run")["interruptions"]
+    assert interruption["after_episode"] == 3
 
 
 # --- What a run leaves behind -------------------------------------------------------------------
@@ -444,43 +411,70 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(
 
 @pytest.fixture(scope="module")
 def finished(run_config, tmp_path_factory):
-    """A finished run: its configuration and folder."""
-    config: RunConfig = run_config("CartPole-v1", "mace_full", 0, episodes=5)
+    """A finished run: its configuration and folder, where only the results are left."""
+    config = run_config("CartPole-v1", "mace_full", 0, episodes=5)
     directory = tmp_path_factory.mktemp("runs") / "deep" / "er"
     run.run(config, directory)
+    assert files(directory) == RESULTS
     return SimpleNamespace(config=config, directory=directory)
 
 
-def test_only_the_results_are_left(finished):
-    assert files(finished.directory) == RESULTS
-
-
-def test_episodes_csv_holds_the_records_to_the_bit(finished):
-    trainer = Trainer(finished.config)
-    for _ in trainer.run():
-        pass
+def test_the_tables_hold_the_records_to_the_bit(finished):
+    trainer = finish(finished.config)
     frame = read_episodes(finished.directory / "episodes.csv", 5)
     assert frame.to_dict("records") == [vars(record) for record in trainer.records]
+    frame = pd.read_csv(finished.directory / "diagnostics.csv")
+    expected = [vars(record) for record in trainer.diagnostics]
+    np.testing.assert_equal(frame.to_dict("records"), expected)
 
 
-def test_agent_is_the_trained_one_and_loads_as_plain_data(finished):
-    path = finished.directory / "agent.pt"
-    trainer = Trainer(finished.config)
-    for _ in trainer.run():
-        pass
-    loaded = torch.load(path, weights_only=True)
-    for name, network in {"actor": trainer.ppo.actor, **trainer.ppo.critics}.items():
-        assert (loaded["networks"][name]["parameters"].numpy() == network.parameters).all()
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"engine": "torch"}, {"ppo": {"network": LAYER_NORM}}],
+    ids=["compiled", "torch", "LayerNorm"],
+)
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
+def test_agent_is_torch_modules_that_act_as_the_trainer_does(
+    run_config, tmp_path, environment, changes
+):
+    """From observations as they are; Pendulum's are normalised, and what the critics get."""
+    box = environment == "Pendulum-v1"
+    changes = merge(changes, {"episodes": 3, "ppo": {"normalise_observations": box}})
+    config = run_config(environment, "mace_full", 0, **changes)
+    run.run(config, tmp_path)
+    agent, trainer, rng = load_agent(tmp_path), finish(config), np.random.default_rng(0)
+    space = trainer.environment.observation_space
+    space.seed(0)
+    rows = np.stack([trainer.environment.encode(space.sample()) for _ in range(50)])
+    noise = rng.standard_normal((50, 1)) if box else rng.random(50)
+    acting, policy = trainer.ppo.acting_policy(), agent.policy(rows)
+    drawn = [acting.act(*pair) for pair in zip(rows, noise, strict=True)]
+    actions, log_probs = (np.array(parts) for parts in zip(*drawn, strict=True))
+    found = policy.log_prob(torch.from_numpy(actions)).detach()
+    np.testing.assert_allclose(found, log_probs, rtol=1e-4, atol=1e-4)
+    if box:
+        expected = policy.mean + policy.stddev * torch.from_numpy(noise)
+        np.testing.assert_allclose(actions, expected.detach(), rtol=1e-4, atol=1e-5)
+    else:
+        expected = (torch.from_numpy(noise)[:, None] >= policy.probs.cumsum(1)).sum(1)
+        assert (actions == expected.numpy()).all()
+    one = agent.policy(rows[0]).log_prob(torch.from_numpy(actions)[0])
+    torch.testing.assert_close(one, policy.log_prob(torch.from_numpy(actions))[0])
+    assert (agent.policy.mean != 0).any() == box
+    for kind, critic in trainer.ppo.critics.items():
+        values = agent.critics[kind](torch.from_numpy(rows)).detach()
+        np.testing.assert_allclose(values, critic.forward(rows).outputs, rtol=1e-4, atol=1e-5)
+    assert np.isfinite(evaluate(tmp_path, 2, 0)).all()
 
 
 def test_run_json_says_where_the_results_come_from(finished):
     found = provenance_of(finished.directory)
-    assert found["config"] == finished.config.model_dump()
+    assert found["config"] == finished.config.settings()
     assert found["versions"]["torch"] == torch.__version__
     assert found["versions"]["numpy"] == np.__version__
     assert found["versions"]["gymnasium"] == gymnasium.__version__
     assert found["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["sources"] == sources.digest(sources.PACKAGE / "run.py")
+    assert found["sources"] == sources.digest(sources.PACKAGE / "runs" / "run.py")
     assert set(found["code"]) == {"commit", "dirty"}
     assert found["machine"]["cores"] == os.cpu_count() and found["machine"]["cpu"]
     assert found["threads"] == 1
@@ -489,7 +483,7 @@ def test_run_json_says_where_the_results_come_from(finished):
     assert 50 < found["peak_memory_mb"] < 5000
     assert found["outputs"] == {
         name: hashlib.sha256((finished.directory / name).read_bytes()).hexdigest()
-        for name in ("episodes.csv", "agent.pt")
+        for name in OUTCOME
     }
 
 
@@ -498,18 +492,6 @@ def test_progress_says_how_far_it_is(interrupted):
     assert (progress["episode"], progress["episodes"]) == (1, 6)  # then not for two seconds
     assert progress["env_steps"] == progress["recent_return"]  # CartPole pays 1 a step
     assert progress["pid"] == os.getpid()
-    rate = progress["env_steps"] / progress["seconds"]
-    assert progress["steps_per_second"] == pytest.approx(rate)
-
-
-def test_run_that_failed_gives_its_folder_back(run_config, tmp_path, kill):
-    config = run_config("CartPole-v1", "ppo", 0, episodes=3)
-    kill(2)
-    with pytest.raises(Killed):
-        run.run(config, tmp_path)
-    kill(None)
-    run.run(config, tmp_path)
-    assert files(tmp_path) == RESULTS
 
 
 # --- When a checkpoint is due -------------------------------------------------------------------
@@ -520,7 +502,7 @@ def test_checkpoints_cost_at_most_one_percent(monkeypatch, cost, wait):
     """Every 10 s, or as seldom as their cost demands; the clock is set by hand."""
     now = [1000.0]
     monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    clock = run.Clock(start=900.0)  # 100 s were spent before an interruption
+    clock = run.Clock(900.0, 2.0)  # 100 s were spent before an interruption
     assert clock.elapsed() == 100 and not clock.checkpoint_due()
     now[0] += 10
     assert clock.checkpoint_due()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mace_rl import statistics as s
+from mace_rl.results import statistics as s
 
 REPETITIONS = 5000
 FIVE = np.array([186.0, 201.0, 249.0, 140.0, 120.0])
@@ -20,13 +20,6 @@ def generator(seed=0):
 
 def interval(values, seed=0):
     return s.mean_interval(values, 0.95, REPETITIONS, generator(seed))
-
-
-def test_interquartile_mean_by_hand():
-    assert s.interquartile_mean(np.array([100.0, 1, 2, 3, 4, 5, 6, -50])) == 3.5  # of 2, 3, 4, 5
-    assert s.interquartile_mean(np.array([9.0, 1, 2, 3, 0])) == 2  # of 1, 2, 3: floor(5 / 4) off
-    assert s.interquartile_mean(np.array([0.0, 1, 5])) == 2  # three: nothing off
-    np.testing.assert_array_equal(s.interquartile_mean(np.array([[0.0, 1, 1, 9]]), axis=1), [1])
 
 
 def test_below_ten_seeds_the_interval_is_students():
@@ -45,24 +38,6 @@ def test_from_ten_seeds_on_the_interval_is_the_percentile_bootstrap():
     np.testing.assert_allclose(interval(TWELVE), expected, atol=0.1)
 
 
-def test_bootstrap_of_two_seeds_by_enumeration():
-    # Means of two draws from {0, 1}: 0, ½, 1 with probabilities ¼, ½, ¼.
-    values = np.array([0.0, 1.0])
-    low, high = s.bootstrap_interval(values, np.mean, 0.4, REPETITIONS, generator())
-    assert (low, high) == (0.5, 0.5)  # the tails of 30 % hold the ends
-    low, high = s.bootstrap_interval(values, np.mean, 0.6, REPETITIONS, generator())
-    assert (low, high) == (0, 1)
-
-
-def test_bootstrap_of_the_interquartile_mean_against_a_loop():
-    draws = generator(2)
-    resampled = [
-        scipy.stats.trim_mean(draws.choice(TWELVE, size=12), 0.25) for _ in range(REPETITIONS)
-    ]
-    observed = s.bootstrap_interval(TWELVE, s.interquartile_mean, 0.95, REPETITIONS, generator())
-    np.testing.assert_allclose(observed, np.percentile(resampled, [2.5, 97.5]), atol=0.15)
-
-
 @pytest.mark.parametrize("seeds", [5, 12])
 def test_curves_are_treated_point_by_point(seeds, monkeypatch):
     values = generator(3).normal(size=(seeds, 50))
@@ -71,12 +46,6 @@ def test_curves_are_treated_point_by_point(seeds, monkeypatch):
     assert low.shape == high.shape == (50,)
     for point in (0, 6, 7, 49):
         np.testing.assert_allclose((low[point], high[point]), interval(values[:, point]))
-
-
-def test_the_generator_decides():
-    values = generator().normal(size=12)
-    assert interval(values) == interval(values)
-    assert interval(values) != interval(values, seed=1)
 
 
 @pytest.mark.parametrize("seeds", [5, 15])
@@ -92,8 +61,6 @@ def test_intervals_cover_the_true_mean_about_as_often_as_they_say(seeds):
 def test_one_seed_allows_no_interval():
     assert np.isnan(interval(np.array([5.0]))).all()
     assert np.isnan(interval(np.ones((1, 3)))).all()
-    nothing = s.bootstrap_interval(np.array([5.0]), np.mean, 0.95, REPETITIONS, generator())
-    assert np.isnan(nothing).all()
 
 
 def test_equal_seeds_give_an_interval_of_no_width():
@@ -109,36 +76,31 @@ def test_paired_comparison_against_scipy_and_enumeration():
     assert (result.low, result.high) == pytest.approx(
         scipy.stats.ttest_rel(FIVE, OTHER).confidence_interval(0.95)
     )
-    assert result.t_test == pytest.approx(scipy.stats.ttest_rel(FIVE, OTHER).pvalue)
     flips = [abs(np.dot(signs, difference)) for signs in product((-1, 1), repeat=5)]
-    assert result.sign_flip == np.mean(np.array(flips) >= abs(difference.sum()))
-    assert result.seeds == 5
+    assert result.p_value == np.mean(np.array(flips) >= abs(difference.sum()))
 
 
 def test_pairing_finds_a_small_difference_behind_large_seed_effects():
     noise = generator(5).normal(size=8) * 1000
-    result = s.paired_comparison(
-        noise + 1 + generator(6).normal(size=8) * 0.1, noise, 0.95, REPETITIONS, generator()
-    )
-    assert result.t_test < 0.001
-    assert result.sign_flip == 2 / 2**8  # no smaller p value exists for eight seeds
-    assert scipy.stats.ttest_ind(noise + 1, noise).pvalue > 0.9
+    shifted = noise + 1 + generator(6).normal(size=8) * 0.1
+    result = s.paired_comparison(shifted, noise, 0.95, REPETITIONS, generator())
+    assert result.low > 0.8
+    assert result.p_value == 2 / 2**8  # no smaller p value exists for eight seeds
+    assert scipy.stats.ttest_ind(shifted, noise).pvalue > 0.9
 
 
 def test_paired_comparison_at_its_limits():
-    same = s.paired_comparison(FIVE, FIVE, 0.95, REPETITIONS, generator())
-    assert same[:5] == (0, 0, 0, 1, 1)
-    shifted = s.paired_comparison(FIVE + 1, FIVE, 0.95, REPETITIONS, generator())
-    assert shifted[:5] == (1, 1, 1, 0, 2 / 2**5)
+    assert s.paired_comparison(FIVE, FIVE, 0.95, REPETITIONS, generator()) == (0, 0, 0, 1)
+    for n in (2, 5):
+        shifted = s.paired_comparison(FIVE[:n] + 1, FIVE[:n], 0.95, REPETITIONS, generator())
+        assert shifted == (1, 1, 1, 2 / 2**n)
     one = s.paired_comparison(FIVE[:1], OTHER[:1], 0.95, REPETITIONS, generator())
     assert one.difference == 16
-    assert np.isnan(one[1:5]).all()
-    with pytest.raises(ValueError, match=r"\(5,\) and \(4,\)"):
-        s.paired_comparison(FIVE, OTHER[:4], 0.95, REPETITIONS, generator())
+    assert np.isnan(one[1:]).all()
 
 
 def test_probability_of_improvement_against_a_loop_and_scipy():
-    probability, (low, high) = s.probability_of_improvement(
+    probability, low, high = s.probability_of_improvement(
         FIVE, OTHER[:4], 0.95, REPETITIONS, generator()
     )
     wins = [(x > y) + 0.5 * (x == y) for x in FIVE for y in OTHER[:4]]
@@ -159,10 +121,10 @@ def test_probability_of_improvement_at_its_limits():
             np.array(x, float), np.array(y, float), 0.95, REPETITIONS, generator()
         )
 
-    assert probability([2, 3], [0, 1]) == (1, (1, 1))
-    assert probability([0, 1], [2, 3]) == (0, (0, 0))
-    assert probability([1, 1], [1, 1]) == (0.5, (0.5, 0.5))
-    value, bounds = probability([2], [1, 3])
+    assert probability([2, 3], [0, 1]) == (1, 1, 1)
+    assert probability([0, 1], [2, 3]) == (0, 0, 0)
+    assert probability([1, 1], [1, 1]) == (0.5, 0.5, 0.5)
+    value, *bounds = probability([2], [1, 3])
     assert value == 0.5
     assert np.isnan(bounds).all()
 
@@ -173,17 +135,6 @@ def test_holm_by_hand():
     np.testing.assert_allclose(s.holm([0.5, 0.9]), [1, 1])
     assert s.holm([0.05]).tolist() == [0.05]
     assert s.holm([]).tolist() == []
-
-
-def test_holm_rejects_what_the_step_down_procedure_rejects():
-    for seed in range(50):
-        p = generator(seed).random(6) ** 3
-        rejected = set()
-        for k, i in enumerate(sorted(range(6), key=p.__getitem__)):
-            if p[i] > 0.05 / (6 - k):
-                break
-            rejected.add(i)
-        assert set(np.flatnonzero(s.holm(p) <= 0.05)) == rejected
 
 
 @pytest.mark.parametrize("p", [[-0.1], [1.1, 0.5], [float("nan")]])

@@ -9,19 +9,21 @@ from typing import Any
 import pytest
 import yaml
 
-from mace_rl.hyperparameters import ConfigError
-from mace_rl.study import load_study, merge, read_study, read_yaml, typed
+from mace_rl.config.reading import merge, read_yaml, typed
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.config.study import load_study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
+RULES = CONFIG.parent / "workflow" / "rules"
 PLAIN = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
-DELETE = object()
 
 
 def changed(over: dict[str, Any], base: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A copy of config.yaml's content with values replaced, or deleted by `DELETE`."""
+    """A copy of config.yaml's content with values replaced, or deleted where they are "DELETE"."""
     result = copy.deepcopy(PLAIN if base is None else base)
     for key, value in over.items():
-        if value is DELETE:
+        if value == "DELETE":
             del result[key]
         elif isinstance(value, dict) and isinstance(result.get(key), dict):
             result[key] = changed(value, result[key])
@@ -30,170 +32,90 @@ def changed(over: dict[str, Any], base: dict[str, Any] | None = None) -> dict[st
     return result
 
 
-# What is changed, and what the message has to name: the key, the value, what would be right.
-MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "unknown key at the top": (
-        {"enviroments": ["CartPole-v1"]},
-        ["'enviroments'", "'environments'"],
-    ),
-    "unknown hyperparameter": (
-        {"training": {"ppo": {"clpi": 0.2}}},
-        ["training", "'ppo.clpi'", "0.2", "'clip'"],
-    ),
-    "unknown key of an environment": (
-        {"environment_settings": {"HopperBulletEnv-v0": {"episode": 10}}},
-        ["environment_settings.HopperBulletEnv-v0", "'episode'", "10", "'episodes'"],
-    ),
-    "unknown key of a variant": (
-        {"variant_settings": {"mace_full": {"memory": {"capcity": 7}}}},
-        ["variant_settings.mace_full", "'memory.capcity'", "7", "'capacity'"],
-    ),
-    "unknown key of a variant that is not selected": (
-        {"variant_settings": {"mace_fixed_0.2": {"metaa": {}}}},
-        ["variant_settings.mace_fixed_0.2", "'metaa'", "'meta'"],
-    ),
-    "unknown key of β's schedule": (
-        {"variant_settings": {"mace_full": {"beta": {"kind": "meta", "initial": 0.4, "flor": 0}}}},
-        ["variant_settings.mace_full", "flor"],
-    ),
-    "unknown kind of β": (
-        {"variant_settings": {"mace_full": {"beta": {"kind": "mata"}}}},
-        ["variant_settings.mace_full", "beta", "mata", "'meta'"],
-    ),
-    "incomplete β": (
-        {"variant_settings": {"mace_fixed": {"beta": {"initial": DELETE}}}},
-        ["variant_settings.mace_fixed", "beta", "initial", "missing"],
-    ),
-    "unknown key of metrics": (
-        {"metrics": {"treshold": 0.5}},
-        ["'metrics.treshold'", "'threshold'"],
-    ),
-    "unknown key of figure": ({"figure": {"colums": 2}}, ["'figure.colums'", "'columns'"]),
-    "missing section": ({"metrics": DELETE}, ["'metrics'", "missing"]),
-    "missing hyperparameter": (
-        {"training": {"ppo": {"clip": DELETE}}},
-        ["training", "'ppo.clip'", "missing"],
-    ),
-    "text for a number": (
-        {"training": {"ppo": {"clip": "high"}}},
-        ["training", "ppo.clip", "'high'", "number"],
-    ),
-    "YAML's 3e-4": (
-        {"training": {"ppo": {"actor_learning_rate": "3e-4"}}},
-        ["ppo.actor_learning_rate", "'3e-4'", "write 0.0003"],
-    ),
-    "quoted number of episodes": (
-        {"environment_settings": {"HopperBulletEnv-v0": {"episodes": "6000"}}},
-        ["environment_settings.HopperBulletEnv-v0", "episodes", "'6000'", "write 6000"],
-    ),
-    "fractional episodes": ({"training": {"episodes": 10.5}}, ["episodes", "10.5", "integer"]),
-    "boolean for a number": ({"training": {"episodes": True}}, ["episodes", "True", "integer"]),
-    "negative budget": (
-        {"training": {"episodes": -5}},
-        ["training", "episodes", "-5", "greater than 0"],
-    ),
-    "budget of zero": (
-        {"environment_settings": {"HopperBulletEnv-v0": {"episodes": 0}}},
-        ["environment_settings.HopperBulletEnv-v0", "episodes", "0"],
-    ),
-    "discount above 1": ({"training": {"ppo": {"discount": 1.5}}}, ["ppo.discount", "1.5", "1"]),
-    "NaN": (
-        {"training": {"ppo": {"clip": float("nan")}}},
-        ["ppo.clip", "nan", "finite"],
-    ),
-    "more neighbours than capacity": (
-        {"training": {"memory": {"capacity": 5}}},
-        ["memory", "neighbours", "capacity"],
-    ),
-    "unknown environment": (
-        {"environments": ["CartPole-v9"]},
-        ["environments", "'CartPole-v9'", "'CartPole-v1'"],
-    ),
-    "environment without version": ({"environments": ["Acrobot"]}, ["'Acrobot'", "'Acrobot-v1'"]),
-    "settings of an unknown environment": (
-        {"environment_settings": {"HoperBulletEnv-v0": {"episodes": 5}}},
-        ["environment_settings", "'HoperBulletEnv-v0'", "'HopperBulletEnv-v0'"],
-    ),
-    "environment without a time limit": (
-        {"environments": ["CliffWalking-v1"]},
-        ["environments", "'CliffWalking-v1'", "time limit"],
-    ),
-    "environment whose package is missing": (
-        {"environments": ["LunarLander-v3"]},
-        ["environments", "'LunarLander-v3'", "installed"],
-    ),
-    "environment in a namespace": (
-        {"environments": ["phys2d/CartPole-v1"]},
-        ["environments", "'phys2d/CartPole-v1'", "letters"],
-    ),
-    "environment that leaves the folder": ({"environments": ["../x"]}, ["'../x'", "letters"]),
-    "no random return for an environment": (
-        {"environments": ["MountainCar-v0"]},
-        ["metrics.random_return.MountainCar-v0", "missing"],
-    ),
-    "unknown variant": (
-        {"variants": ["ppo", "mace_ful"]},
-        ["variants", "'mace_ful'", "'mace_full'"],
-    ),
-    "variant with a space": (
-        {"variant_settings": {"mace full": {"beta": {"kind": "none"}}}},
-        ["variant_settings", "'mace full'", "letters"],
-    ),
-    "variant with a pattern": (
-        {"variant_settings": {"{seed}": {"beta": {"kind": "none"}}}},
-        ["variant_settings", "'{seed}'", "letters"],
-    ),
-    "label of an unknown variant": (
-        {"labels": {"mace_ful": "x"}},
-        ["labels", "'mace_ful'", "'mace_full'"],
-    ),
-    "colour of an unknown variant": ({"colours": {"pppo": "k"}}, ["colours", "'pppo'", "'ppo'"]),
-    "missing label": ({"labels": {"ppo": DELETE}}, ["labels.ppo", "missing"]),
-    "missing colour": ({"colours": {"ppo": DELETE}}, ["colours.ppo", "missing"]),
-    "no colour": ({"colours": {"ppo": "bluish"}}, ["colours.ppo", "'bluish'", "tab:blue"]),
-    "duplicate seeds": ({"seeds": [0, 1, 0]}, ["seeds", "[0, 1, 0]", "0 should be there once"]),
-    "duplicate environments": (
-        {"environments": ["CartPole-v1", "CartPole-v1"]},
-        ["environments", "'CartPole-v1' should be there once"],
-    ),
-    "duplicate variants": (
-        {"variants": ["ppo", "ppo"]},
-        ["variants", "'ppo' should be there once"],
-    ),
-    "one seed that is no list": ({"seeds": 3}, ["seeds", "3", "list"]),
-    "negative seed": ({"seeds": [-1]}, ["seeds.0", "-1", "0"]),
-    "fractional seed": ({"seeds": [0.5]}, ["seeds.0", "0.5", "integer"]),
-    "seed beyond 32 bits": ({"seeds": [2**32]}, ["seeds.0", "4294967296"]),
-    "no seeds": ({"seeds": []}, ["seeds", "[]", "at least 1"]),
-    "no environments": ({"environments": []}, ["environments", "[]", "at least 1"]),
-    "no variants": ({"variants": []}, ["variants", "[]", "at least 1"]),
-    "empty section": ({"training": None}, ["training", "None", "dictionary"]),
-    "list for a section": ({"variant_settings": ["ppo"]}, ["variant_settings", "dictionary"]),
-    "environment among the hyperparameters": (
-        {"training": {"environment": "CartPole-v1"}},
-        ["training.environment", "'CartPole-v1'", "environments"],
-    ),
-    "seed of a variant": (
-        {"variant_settings": {"ppo": {"seed": 3}}},
-        ["variant_settings.ppo.seed", "3", "seeds"],
-    ),
-    "results folder that is no text": ({"results": 5}, ["results", "5", "string"]),
-    "results folder without a name": ({"results": " "}, ["results", "' '", "folder"]),
-    "results folder with a pattern": ({"results": "r/{env}"}, ["results", "'r/{env}'", "folder"]),
-    "results folder in a file": ({"results": __file__ + "/x"}, ["results", __file__, "is a file"]),
-    "key that is no text": ({7: 8}, ["'7'", "unknown"]),
-}
+# What is read over config.yaml  # what the message names: the key, the value, what would be right
+MISTAKES = """
+enviroments: [CartPole-v1]  # 'enviroments', 'environments'
+7: 8  # unknown, '7'
+training: {ppo: {clpi: 0.2}}  # training, 'ppo.clpi', 0.2, 'clip'
+environment_settings: {Acrobot-v1: {episode: 1}}  # settings.Acrobot-v1, 'episode', 'episodes'
+variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capcity', 7, 'capacity'
+variant_settings: {mace_fixed_0.2: {metaa: {}}}  # variant_settings.mace_fixed_0.2, 'metaa', 'meta'
+variant_settings: {mace_full: {beta: {flor: 0}}}  # variant_settings.mace_full, 'beta.flor'
+variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
+variant_settings: {mace_fixed: {beta: {initial: DELETE}}}  # mace_fixed, 'beta.initial', missing
+metrics: {treshold: 0.5}  # 'metrics.treshold', 'threshold'
+figure: {colums: 2}  # 'figure.colums', 'columns'
+metrics: DELETE  # 'metrics', missing
+training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
+training: {ppo: {clip: high}}  # training, ppo.clip, 'high', number
+training: {ppo: {actor_learning_rate: 3e-4}}  # ppo.actor_learning_rate, '3e-4', write 0.0003
+environment_settings: {Acrobot-v1: {episodes: '60'}}  # Acrobot-v1, episodes, '60', write 60
+training: {episodes: 10.5}  # episodes, 10.5, integer
+training: {episodes: true}  # episodes, True, integer
+training: {episodes: -5}  # training, episodes, -5, greater than 0
+environment_settings: {Acrobot-v1: {episodes: 0}}  # environment_settings.Acrobot-v1, episodes, 0
+training: {ppo: {discount: 1.5}}  # ppo.discount, 1.5, 1
+training: {ppo: {clip: .nan}}  # ppo.clip, nan, finite
+training: {memory: {capacity: 5}}  # memory, neighbours, capacity
+training: {engine: jax}  # engine, 'jax', 'torch'
+training: {novelty: {kind: custom}}  # training, novelty, estimator, kind
+training: {meta: DELETE}  # 'meta', missing
+training: null  # training, None, dictionary
+training: {environment: CartPole-v1}  # training.environment, 'CartPole-v1', environments
+training: {ppo: {network: {kind: cnn}}}  # ppo.network, cnn, 'mlp'
+training: {ppo: {network: {kind: torch}}}  # ppo.network, module, missing
+training: {ppo: {network: {kind: torch, module: a:b, sze: 3}}}  # 'ppo.network.sze', 'module'
+training: {ppo: {network: {kind: torch, module: net}}}  # module, 'net', package.module:Name
+training: {ppo: {network: {kind: torch, module: no_such:thing}}}  # network.module, no_such:thing
+variant_settings: {x: {beta: {kind: custom, rule: no_such:Rule}}}  # x, beta.rule, 'no_such:Rule'
+metrics: {custom: [no_such:metric]}  # metrics.custom, 'no_such:metric'
+environments: [no_such:Walk-v0]  # environment, 'no_such:Walk-v0', no_such
+environments: [CartPole-v9]  # environments, 'CartPole-v9', 'CartPole-v1'
+environments: [Acrobot]  # 'Acrobot', 'Acrobot-v1'
+environment_settings: {HoperBulletEnv-v0: {}}  # 'HoperBulletEnv-v0', 'HopperBulletEnv-v0'
+environments: [CliffWalking-v1]  # environments, settings.CliffWalking-v1.max_episode_steps should
+environment_settings: {Blackjack-v1: {}}  # time limit, settings.Blackjack-v1.max_episode_steps
+environment_settings: {CliffWalking-v1: {max_episode_steps: 0}}  # CliffWalking-v1, steps, 0
+environments: [LunarLander-v3]  # environments, 'LunarLander-v3', installed
+environments: [phys2d/CartPole-v1]  # environments, 'phys2d/CartPole-v1', letters
+environments: [../x]  # '../x', letters
+environments: [MountainCar-v0]  # metrics.random_return.MountainCar-v0, missing
+environments: [CartPole-v1, CartPole-v1]  # environments, 'CartPole-v1' should be there once
+environments: []  # environments, [], at least 1
+variants: [ppo, mace_ful]  # variants, 'mace_ful', 'mace_full'
+variants: [ppo, ppo]  # variants, 'ppo' should be there once
+variants: []  # variants, [], at least 1
+variant_settings: {mace full: {beta: {kind: none}}}  # variant_settings, 'mace full', letters
+variant_settings: {'{seed}': {beta: {kind: none}}}  # variant_settings, '{seed}', letters
+variant_settings: {mace_ful: {label: x}}  # variant_settings.mace_ful, beta, missing
+variant_settings: {ppo: {label: 3}}  # ppo.label, 3
+variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluish', tab:blue
+variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
+variant_settings: {mace_fixed: {meta: {}}}  # mace_fixed, 'meta', 'exponential' does not use
+variant_settings: {ppo: {seed: 3}}  # variant_settings.ppo.seed, 3, seeds
+variant_settings: [ppo]  # variant_settings, dictionary
+seeds: [0, 1, 0]  # seeds, [0, 1, 0], 0 should be there once
+seeds: 3  # seeds, 3, list
+seeds: [-1]  # seeds.0, -1, 0
+seeds: [0.5]  # seeds.0, 0.5, integer
+seeds: [4294967296]  # seeds.0, 4294967296
+seeds: []  # seeds, [], at least 1
+results: 5  # results, 5, string
+results: ' '  # results, ' ', folder
+results: 'r/{env}'  # results, 'r/{env}', folder
+results: CONFIG/x  # results, CONFIG, is a file
+"""
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-def test_mistake_is_named_in_one_line(name: str) -> None:
-    change, expected = MISTAKES[name]
+@pytest.mark.parametrize("line", MISTAKES.strip().splitlines())
+def test_mistake_is_named_in_one_line(line: str) -> None:
+    change, _, expected = line.replace("CONFIG", str(CONFIG)).partition("  # ")
     with pytest.raises(ConfigError) as caught:
-        load_study(changed(change), "some.yaml")
+        load_study(changed(yaml.safe_load(change)), "some.yaml")
     message = str(caught.value)
     assert message.startswith("some.yaml: ")
     assert "\n" not in message
-    for fragment in expected:
+    for fragment in expected.split(", "):
         assert fragment in message.removeprefix("some.yaml: ")
 
 
@@ -203,38 +125,79 @@ def test_configuration_that_is_no_mapping(config: Any) -> None:
         load_study(config, "some.yaml")
 
 
+LAYERS = """
+training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}}
+environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {hidden_units: 2}}}
+variant_settings: {mace_full: {episodes: 3, ppo: {discount: 0.3}}}
+"""
+
+
 def test_settings_go_over_one_another_in_order() -> None:
-    study = load_study(
-        changed(
-            {
-                "training": {"episodes": 1, "ppo": {"clip": 0.1, "epochs": 1}},
-                "environment_settings": {
-                    "CartPole-v1": {
-                        "episodes": 2,
-                        "ppo": {"clip": 0.2},
-                        "meta": {"hidden_units": 2},
-                    }
-                },
-                "variant_settings": {"mace_full": {"episodes": 3, "ppo": {"discount": 0.3}}},
-            }
-        ),
-        "test",
-    )
+    study = load_study(changed(yaml.safe_load(LAYERS)), "test")
     plain = study.run_config("Acrobot-v1", "ppo", 0)
     assert (plain.episodes, plain.ppo.clip, plain.ppo.epochs) == (1, 0.1, 1)
     assert plain.ppo.discount == PLAIN["training"]["ppo"]["discount"]
-    environment = study.run_config("CartPole-v1", "ppo", 7)
+    environment = study.run_config("CartPole-v1", "mace_fixed", 7)
     assert (environment.episodes, environment.ppo.clip, environment.ppo.epochs) == (2, 0.2, 1)
-    assert (environment.meta.hidden_units, environment.seed) == (2, 7)
+    assert environment.seed == 7
     both = study.run_config("CartPole-v1", "mace_full", 0)
     assert (both.episodes, both.ppo.clip, both.ppo.discount) == (3, 0.2, 0.3)
     assert (both.environment, both.variant) == ("CartPole-v1", "mace_full")
+    assert both.meta.hidden_units == 2
 
 
 def test_beta_is_replaced_as_a_whole() -> None:
     exponential = {"kind": "exponential", "initial": 0.4, "decay": 0.9, "floor": 0.1}
     study = load_study(changed({"training": {"beta": exponential}}), "test")
     assert study.run_config("CartPole-v1", "ppo", 0).beta.model_dump() == {"kind": "none"}
+
+
+SECTIONS = {"memory", "novelty", "meta"}
+
+
+@pytest.mark.parametrize(
+    ("variant", "used"),
+    [("ppo", set()), ("mace_fixed", {"memory", "novelty"}), ("mace_full", SECTIONS)],
+)
+def test_a_run_holds_the_sections_that_its_variant_uses(variant: str, used: set[str]) -> None:
+    """So that a change of the others leaves its settings, and with them its runs, alone."""
+    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"hidden_units": 7}}
+    plain, other = (
+        load_study(changed({"training": training}), "test").run_config("CartPole-v1", variant, 0)
+        for training in ({}, over)
+    )
+    assert SECTIONS & set(plain.settings()) == used
+    assert {key for key in SECTIONS if getattr(plain, key) is not None} == used
+    settings, others = plain.settings(), other.settings()
+    assert {key for key in settings if settings[key] != others[key]} == used
+    assert check(RunConfig, settings, "run.json") == plain
+
+
+@pytest.mark.parametrize("variant", ["ppo", "mace_fixed", "mace_full"])
+def test_settings_of_an_old_run_json_still_read(variant: str) -> None:
+    """It has every section, whatever the variant, and no key that came later."""
+    study = load_study(PLAIN, "test")
+    config, full = (study.run_config("CartPole-v1", name, 3) for name in (variant, "mace_full"))
+    old = full.settings() | {key: config.settings()[key] for key in ("variant", "beta")}
+    old = changed(
+        {
+            **dict.fromkeys(("engine", "environment_arguments"), "DELETE"),
+            "ppo": {"network": "DELETE"},
+            "novelty": dict.fromkeys(("kind", "estimator", "arguments"), "DELETE"),
+        },
+        old,
+    )
+    assert check(RunConfig, old, "run.json") == config
+
+
+def test_labels_and_colours_stand_with_the_variants() -> None:
+    look = {"label": "PPO itself", "colour": "k"}
+    more = {"ppo": look, "mine": {"beta": {"kind": "none"}}}
+    settings = {"variants": ["mine", "ppo"], "variant_settings": more}
+    study = load_study(changed(settings), "test")
+    assert study.labels == {"mine": "mine", "ppo": "PPO itself"}
+    assert study.colours["ppo"] == "k" and study.colours["mine"].startswith("C")
+    assert not {"label", "colour"} & set(study.run_config("CartPole-v1", "ppo", 0).settings())
 
 
 def test_run_config_of_a_run_outside_the_lists() -> None:
@@ -315,7 +278,11 @@ def test_numbers_from_the_command_line(given: Any, expected: Any) -> None:
 
 
 def test_planning_imports_nothing_slow() -> None:
-    code = "import sys, mace_rl.study, mace_rl.sources, mace_rl.progress; print(*sys.modules)"
+    """Whatever of this project the rules import."""
+    rules = [line for rule in RULES.glob("*.smk") for line in rule.read_text("utf-8").splitlines()]
+    code = [line for line in rules if line.startswith(("from ", "import ")) and "mace_rl" in line]
+    code = "\n".join([*code, "import sys; print(*sys.modules)"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
+    assert "mace_rl.config.study" in loaded
     assert not loaded & {"torch", "numba", "pandas", "scipy.stats", "matplotlib.pyplot", "pybullet"}

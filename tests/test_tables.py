@@ -1,21 +1,23 @@
-"""Tables from a small frame: the numbers against pandas and scipy, the LaTeX by its structure."""
+"""Tables and comparisons from a small frame: numbers against scipy, LaTeX by its structure."""
 
 import re
 import shutil
 import subprocess
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
 
-from mace_rl.hyperparameters import PPOConfig
-from mace_rl.metrics import METRICS_COLUMNS, MetricsConfig
-from mace_rl.tables import (
+from mace_rl.config.run import PPOConfig, TorchModule
+from mace_rl.config.study import read_study
+from mace_rl.results.comparisons import comparisons, pairs
+from mace_rl.results.metrics import METRICS, Metric, metrics_columns
+from mace_rl.results.tables import (
     PAPER_TABLE1,
-    SUPPLEMENT_METRICS,
     latex,
-    summary,
     supplement,
     supplement_latex,
     table1,
@@ -23,33 +25,14 @@ from mace_rl.tables import (
     table2_latex,
 )
 
-SETTINGS = MetricsConfig(
-    final_fraction=0.1,
-    threshold=0.75,
-    moving_average=50,
-    convergence_band=0.1,
-    confidence=0.95,
-    bootstrap_repetitions=1000,
-    bootstrap_seed=0,
-    random_return={},
-)
+STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
+SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
 PAPER = ["Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0"]
 VARIANTS = ["ppo", "mace_fixed", "mace_full"]
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
-PPO = PPOConfig(
-    actor_learning_rate=0.0003,
-    critic_learning_rate=0.001,
-    discount=0.99,
-    epochs=4,
-    clip=0.2,
-    gae_lambda=1.0,
-    entropy_coefficient=1e-05,
-    rollout_steps=1,
-    minibatch_size=None,
-    hidden_units=[64, 32],
-    initial_log_std=0.0,
-    max_gradient_norm=0.5,
-    normalise_observations=False,
+WORST = Metric("worst", "Worst & last", "return", lambda curve: curve.returns.min())
+PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(
+    update={"entropy_coefficient": 1e-05, "hidden_units": [64, 32]}
 )
 
 
@@ -57,17 +40,14 @@ def metrics(environments=PAPER, variants=VARIANTS, seeds=3, **values):
     """A metrics.csv; `values` are per variant, [seeds] each: `sample_efficiency={"ppo": [...]}`."""
     draws = np.random.default_rng(0)
     rows = []
-    for environment in environments:
-        for variant in variants:
-            for seed in range(seeds):
-                row = dict.fromkeys(METRICS_COLUMNS, 0)
-                row |= {name: int(draws.integers(100, 990)) for name in SUPPLEMENT_METRICS}
-                row |= {"env": environment, "variant": variant, "seed": seed, "episodes": 2000}
-                row |= {"sample_efficiency": int(draws.integers(100, 990))}
-                row |= {"convergence_steps": int(draws.integers(1000, 2000))}
-                row |= {"final_return": -85.25, "area_under_curve": -116.75}
-                row |= {name: given[variant][seed] for name, given in values.items()}
-                rows.append(row)
+    for environment, variant, seed in product(environments, variants, range(seeds)):
+        row = dict.fromkeys(metrics_columns(METRICS), 0)
+        row |= {metric.name: int(draws.integers(100, 990)) for metric in METRICS}
+        row |= {"env": environment, "variant": variant, "seed": seed, "episodes": 2000}
+        row |= {"convergence_steps": int(draws.integers(1000, 2000))}
+        row |= {"final_return": -85.25, "area_under_curve": -116.75}
+        row |= {name: given[variant][seed] for name, given in values.items()}
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -117,10 +97,10 @@ def test_censored_runs_are_counted_and_kept():
         sample_efficiency={"ppo": [100, 2000, 2000]},
         sample_efficiency_censored={"ppo": [0, 1, 1]},
     )
-    row = summary(frame, ["sample_efficiency"], SETTINGS).iloc[0]
+    row = table1(frame, SETTINGS).iloc[0]
     assert row["mean"] == pytest.approx(4100 / 3)
     assert row["censored"] == 2
-    assert r"\textbf{1367}$^{\dagger2}$" in table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    assert r"\textbf{1367}$^{\dagger2}$" in table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
 
 
 def test_no_cell_depends_on_another_environment_or_variant():
@@ -132,21 +112,13 @@ def test_no_cell_depends_on_another_environment_or_variant():
     pd.testing.assert_frame_equal(alone, among.reset_index(drop=True), check_exact=True)
 
 
-def test_table1_csv_comes_back_to_the_bit(tmp_path):
-    written = table1(metrics(), SETTINGS)
-    written.to_csv(tmp_path / "table1.csv", index=False)
-    read = pd.read_csv(tmp_path / "table1.csv")
-    for name in ("mean", "low", "high"):
-        assert read[name].to_numpy().tobytes() == written[name].to_numpy().tobytes()
-
-
 def test_table1_has_the_papers_layout():
     frame = metrics(
         ["CartPole-v1"],
         sample_efficiency={"ppo": [1, 2, 3], "mace_fixed": [120] * 3, "mace_full": [104] * 3},
         convergence_steps={"ppo": [660] * 3, "mace_fixed": [620] * 3, "mace_full": [634] * 3},
     )
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
     found = cells(fragment)
     assert [name for name, _ in found] == list(LABELS)
     # Mean 2, standard error 1 / √3, t of two degrees of freedom 4.303: 2 ± 2.48, but not below 1.
@@ -165,7 +137,7 @@ def test_ties_are_all_bold_as_displayed():
         sample_efficiency={"ppo": [104, 104, 105], "mace_fixed": [104] * 3, "mace_full": [105] * 3},
         convergence_steps={variant: [600] * 3 for variant in VARIANTS},
     )
-    found = cells(table1_latex(table1(frame, SETTINGS), LABELS, 0.95))
+    found = cells(table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS))
     assert r"\textbf{104} / \textbf{600}" in found["ppo", 0]  # 104.33 is shown as 104
     assert r"\textbf{104} / \textbf{600}" in found["mace_fixed", 0]
     assert r"}105 / \textbf{600}" in found["mace_full", 0]
@@ -178,13 +150,13 @@ def test_a_mean_of_seeds_that_all_failed_is_never_the_best():
         convergence_steps={"ppo": [2000] * 3},
         convergence_steps_censored={"ppo": [1] * 3},
     )
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
     assert r" / 2000$^{\dagger3}$" in cells(fragment)["ppo", 0]
     assert "a lower bound" in fragment
 
 
 def test_one_seed_has_no_interval():
-    fragment = table1_latex(table1(metrics(seeds=1), SETTINGS), LABELS, 0.95)
+    fragment = table1_latex(table1(metrics(seeds=1), SETTINGS), LABELS, SETTINGS)
     assert r"{\scriptsize --/--}" in fragment
     assert "One seed, which allows no interval." in fragment
     assert "nan" not in fragment
@@ -193,31 +165,43 @@ def test_one_seed_has_no_interval():
 def test_the_caption_names_the_interval_and_every_budget():
     frame = metrics(seeds=10)
     frame.loc[frame["env"] == "HopperBulletEnv-v0", "episodes"] = 6000
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, 0.95)
+    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
     assert r"Means over 10 seeds and, below, their 95\,\% bootstrap intervals." in fragment
     assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
 
 
 def test_more_than_three_environments_continue_below():
     environments = [*PAPER, "Under_score-v0", "Pendulum-v1"]
-    fragment = table1_latex(table1(metrics(environments), SETTINGS), {}, 0.95)
+    fragment = table1_latex(table1(metrics(environments), SETTINGS), {}, SETTINGS)
     heads = re.findall(r"Algorithm & (.*) \\\\", fragment)
     assert heads == [" & ".join(PAPER), r"Under\_score-v0 & Pendulum-v1"]
     assert fragment.count("mace\\_full &") == 2
 
 
 def test_the_supplement_has_every_companion():
-    fragment = supplement_latex(supplement(metrics(), SETTINGS), LABELS, 0.95)
+    fragment = supplement_latex(supplement(metrics(), SETTINGS), LABELS, SETTINGS)
     found = cells(fragment)
-    assert {name for name, _ in found} == set(SUPPLEMENT_METRICS.values())
+    assert [name for name, place in found if place == 0] == [
+        "Final return",
+        "Mean return of training",
+        "Sample efficiency (range)",
+        "Convergence (range)",
+        "Convergence (flattest)",
+        "Convergence (public code)",
+    ]
     assert r"$-$85.2\\{\scriptsize [$-$85.2,\,$-$85.2]}" in found["Final return", 0]
+    assert "." not in found["Convergence (range)", 0]
     assert fragment.count(r"\multicolumn{4}") == 3
-    companions = [name for name in METRICS_COLUMNS if f"{name}_censored" in METRICS_COLUMNS]
-    assert set(companions) <= {*SUPPLEMENT_METRICS, "sample_efficiency", "convergence_steps"}
+    own = SETTINGS.model_copy(update={"custom": [f"{__name__}:WORST"]})
+    frame = metrics(["CartPole-v1"]).assign(worst=-7.0)
+    fragment = supplement_latex(supplement(frame, own), LABELS, own)
+    assert r"$-$7.0\\" in cells(fragment)[r"Worst \& last", 0]
 
 
 def test_table2_has_the_papers_rows_then_ours():
-    hopper = PPO.model_copy(update={"gae_lambda": 0.95, "normalise_observations": True})
+    changes = {"gae_lambda": 0.95, "normalise_observations": True}
+    changes["network"] = TorchModule(kind="torch", module="my_nets:layer_norm")
+    hopper = PPO.model_copy(update=changes)
     fragment = table2_latex({"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": hopper})
     paper, ours = fragment.split(r"\midrule")[1:]
     assert re.findall(r"\\raggedright (.*) \\\\", paper) == [
@@ -231,10 +215,64 @@ def test_table2_has_the_papers_rows_then_ours():
     assert r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)" in ours
     assert r"no (Acrobot-v1, A\_b-v0)\\yes (Hopper)" in ours
     assert r"Entropy Coefficient & $1 \times 10^{-5}$ \\" in ours
+    assert r"tanh network (Acrobot-v1, A\_b-v0)\\my\_nets:layer\_norm (Hopper)" in ours
     assert "& 64, 32 " in ours
     assert "None" not in ours
     # Every setting is there: five of the paper's rows and Adam, and a row for each of the others.
     assert fragment.count("raggedright") == len(PPOConfig.model_fields) + 1
+
+
+def test_which_variants_are_compared():
+    assert pairs(["ppo", "mace_fixed", "mace_fixed_0.2", "mace_full"]) == [
+        ("mace_fixed", "ppo"),
+        ("mace_fixed_0.2", "ppo"),
+        ("mace_full", "ppo"),
+        ("mace_full", "mace_fixed"),
+    ]
+    assert pairs(["mace_full", "mace_fixed"]) == [("mace_full", "mace_fixed")]
+    frame = comparisons(metrics(variants=["ppo"]), SETTINGS)
+    assert frame.empty
+    assert "p_holm" in frame
+
+
+def test_comparisons_against_scipy_and_enumeration():
+    frame = metrics(
+        ["CartPole-v1", "Acrobot-v1"],
+        seeds=9,
+        final_return={"ppo": range(9), "mace_fixed": range(40, 58, 2), "mace_full": [4] * 9},
+        convergence_steps_censored={"ppo": [1, 0] * 5, "mace_fixed": [0] * 9, "mace_full": [1] * 9},
+    )
+    shuffled = frame.sample(frac=1, random_state=0)  # pairs are those of a seed, in any order
+    result = comparisons(shuffled, SETTINGS)
+    assert len(result) == 2 * len(METRICS) * 3
+    units = {metric.name: metric.unit for metric in METRICS}
+    signs = np.array(list(product((-1, 1), repeat=9)))
+    for row in result.itertuples():
+        runs = frame[frame["env"] == row.env].set_index("variant")[row.metric]
+        x, y = (runs[name].to_numpy(float) for name in (row.variant, row.baseline))
+        paired = scipy.stats.ttest_rel(x, y)
+        assert row.difference == pytest.approx(np.mean(x - y))
+        assert (row.low, row.high) == pytest.approx(paired.confidence_interval(0.95))
+        assert row.p_value == np.mean(abs(signs @ (x - y)) >= abs(sum(x - y)))
+        better = (np.less if units[row.metric] == "episodes" else np.greater).outer(x, y)
+        assert row.probability == pytest.approx(np.mean(better + np.equal.outer(x, y) / 2))
+        assert row.probability_low <= row.probability <= row.probability_high
+        assert row.seeds == 9
+    censored = result[result["metric"] == "convergence_steps"].set_index(["variant", "baseline"])
+    assert set(censored.loc[("mace_full", "ppo"), "censored"]) == {5 + 9}
+    assert result["censored"].sum() == 2 * (5 + 14 + 9)
+    # Holm: the k-th smallest of m times m - k + 1, and never less than one before.
+    p = sorted(result["p_value"])
+    holm = [max(min(1, p[i] * (len(p) - i)) for i in range(k + 1)) for k in range(len(p))]
+    holm = dict(zip(p, holm, strict=True))  # equal ones are adjusted equally
+    assert holm[2 / 2**9] < 0.2
+    assert result["p_holm"].tolist() == pytest.approx([holm[value] for value in result["p_value"]])
+
+
+def test_one_seed_has_a_difference_and_no_p_value():
+    result = comparisons(metrics(seeds=1), SETTINGS)
+    assert result[["low", "high", "p_value", "p_holm", "probability_low"]].isna().all(axis=None)
+    assert result[["difference", "probability"]].notna().all(axis=None)
 
 
 def test_special_characters_are_escaped_once():
@@ -250,16 +288,17 @@ def fragments():
     many["episodes"] = 6000
     labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
     return [
-        table1_latex(table1(many, SETTINGS), labels, 0.95),
-        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, 0.95),
-        supplement_latex(supplement(many, SETTINGS), labels, 0.95),
+        table1_latex(table1(many, SETTINGS), labels, SETTINGS),
+        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS),
+        supplement_latex(supplement(many, SETTINGS), labels, SETTINGS),
         table2_latex({"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})}),
     ]
 
 
-@pytest.mark.parametrize(
-    "fragment", fragments(), ids=["table1", "one seed", "supplement", "table2"]
-)
+FRAGMENTS = dict(zip(("table1", "one seed", "supplement", "table2"), fragments(), strict=True))
+
+
+@pytest.mark.parametrize("fragment", FRAGMENTS.values(), ids=FRAGMENTS)
 def test_the_latex_is_balanced(fragment):
     assert fragment.isascii()
     bare = re.sub(r"\\[\\{}]", "", fragment)
@@ -280,9 +319,7 @@ def test_the_latex_is_balanced(fragment):
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
-@pytest.mark.parametrize(
-    "fragment", fragments(), ids=["table1", "one seed", "supplement", "table2"]
-)
+@pytest.mark.parametrize("fragment", FRAGMENTS.values(), ids=FRAGMENTS)
 def test_pdflatex_compiles_it_within_the_margins(fragment, tmp_path):
     document = (
         "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n"

@@ -1,6 +1,6 @@
 """Kill trainings and whole workflows at bad moments, start them again, and compare to the bit.
 
-    .venv/bin/python tools/kill_test.py [--repeats N] [--seed S]        (make kill-test)
+    python -m tools.kill_test [--repeats N] [--seed S]        (make kill-test)
 
 Every environment and variant of config.yaml is trained once undisturbed. Then, for each, a training
 is killed (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its
@@ -20,14 +20,16 @@ from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
+from mace_rl import files
+
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENTS = ("Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0")
 VARIANTS = ("ppo", "mace_fixed", "mace_full")
 EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
 # Checkpoints as fast as they can be written: the moments to hit are then all through the training.
-TRAIN = "import mace_rl.run as r; r.CHECKPOINT_SECONDS = 0.05; r.CHECKPOINT_COST = 1.0; "
+TRAIN = "import mace_rl.runs.run as r; r.CHECKPOINT_SECONDS = 0.05; r.CHECKPOINT_COST = 1.0; "
 TRAIN += "from mace_rl.cli import main; main()"
-RESULTS = {"agent.pt", "episodes.csv", "run.json"}
+RESULTS = {*files.RESULTS, files.RECORD}
 
 
 def start(environment: str, variant: str, folder: Path) -> subprocess.Popen:
@@ -53,22 +55,22 @@ def names(folder: Path) -> set[str]:
 
 def begun(folder: Path) -> bool:
     """Whether the training in `folder` has saved its first checkpoint."""
-    return "checkpoint.pt" in names(folder)
+    return files.CHECKPOINT in names(folder)
 
 
 def writing_checkpoint(folder: Path) -> bool:
     """Whether a checkpoint is half written at this moment."""
     found = names(folder)
-    return "checkpoint.pt" in found and any(name.startswith(".checkpoint.pt.") for name in found)
+    half_written = f".{files.CHECKPOINT}."
+    return files.CHECKPOINT in found and any(name.startswith(half_written) for name in found)
 
 
 def writing_results(folder: Path) -> bool:
     """Whether some but not all results are there at this moment."""
     found = names(folder)
-    return (
-        any(name.startswith((".agent.pt.", ".episodes.csv.", ".run.json.")) for name in found)
-        or 0 < len(found & RESULTS) < 3
-    )
+    beginnings = tuple(f".{name}." for name in RESULTS)
+    half_written = any(name.startswith(beginnings) for name in found)
+    return half_written or 0 < len(found & RESULTS) < len(RESULTS)
 
 
 def kill_when(
@@ -87,8 +89,7 @@ def kill_when(
 def same(folder: Path, undisturbed: Path) -> bool:
     """Whether `folder` ends with the same records and agent as `undisturbed`, and no leftovers."""
     return names(folder) == RESULTS and all(
-        (folder / name).read_bytes() == (undisturbed / name).read_bytes()
-        for name in ("episodes.csv", "agent.pt")
+        (folder / name).read_bytes() == (undisturbed / name).read_bytes() for name in files.RESULTS
     )
 
 
@@ -140,7 +141,7 @@ def kill_workflows(scratch: Path) -> list[bool]:
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
         if sent:
             process = subprocess.Popen(command, start_new_session=True, **quiet)
-            while process.poll() is None and not list(results.glob("runs/*/*/*/progress.json")):
+            while process.poll() is None and not list(results.glob(f"runs/*/*/*/{files.PROGRESS}")):
                 time.sleep(0.05)
             if sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
                 os.killpg(process.pid, sent)
@@ -151,7 +152,7 @@ def kill_workflows(scratch: Path) -> list[bool]:
         again = subprocess.run(command, **quiet, check=False)
         tables[name] = {
             path.relative_to(results): path.read_bytes()
-            for pattern in ("runs/*/*/*/episodes.csv", "metrics.csv", "table1.*", "figure1.csv")
+            for pattern in (f"runs/*/*/*/{files.EPISODES}", "*.csv", "table1.*")
             for path in sorted(results.glob(pattern))
         }
         if sent:

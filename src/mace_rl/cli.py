@@ -5,9 +5,11 @@ import logging
 import sys
 from pathlib import Path
 
-from mace_rl.hyperparameters import ConfigError, RunConfig
-from mace_rl.provenance import read_record
-from mace_rl.study import read_study
+from mace_rl import files
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.config.study import read_study
+from mace_rl.runs.provenance import read_record
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +32,11 @@ def parser() -> argparse.ArgumentParser:
     train.add_argument("--episodes", type=int, help="instead of the config's budget")
     train.add_argument(
         "--config", type=Path, help="a YAML file read over the project's config.yaml"
+    )
+    train.add_argument(
+        "--engine",
+        choices=["compiled", "torch"],
+        help="of every network: compiled (default) or plain PyTorch, slower, to check it by",
     )
     train.add_argument("--out", required=True, type=Path, help="folder for the results")
     evaluate = commands.add_parser(
@@ -57,26 +64,29 @@ def run_config(arguments: argparse.Namespace) -> RunConfig:
     """The run that the command line asks for; raises `ConfigError`."""
     study = read_study([CONFIG, arguments.config] if arguments.config else [CONFIG])
     config = study.run_config(arguments.env, arguments.variant, arguments.seed)
-    if arguments.episodes is None:
-        return config
-    if arguments.episodes < 1:
-        raise ConfigError(f"--episodes is {arguments.episodes}, but should be at least 1")
-    return config.model_copy(update={"episodes": arguments.episodes})
+    changes: dict[str, object] = {}
+    if arguments.episodes is not None:
+        if arguments.episodes < 1:
+            raise ConfigError(f"--episodes is {arguments.episodes}, but should be at least 1")
+        changes["episodes"] = arguments.episodes
+    if arguments.engine is not None:
+        changes["engine"] = arguments.engine
+    return config.model_copy(update=changes)
 
 
 def finished(config: RunConfig, directory: Path) -> bool:
     """Whether `directory` holds the results of this run; `ConfigError` if they are of another."""
-    record = directory / "run.json"
+    record = directory / files.RECORD
     if not record.exists():
         return False
-    found = read_record(record)["config"]
-    wanted = config.model_dump()
-    different = [key for key in wanted if found.get(key) != wanted[key]]
+    found = check(RunConfig, read_record(record)["config"], str(record)).settings()
+    wanted = config.settings()
+    different = [key for key in wanted | found if found.get(key) != wanted.get(key)]
     if different:
         key = different[0]
         raise ConfigError(
             f"{directory} holds a finished run whose {key} is {found.get(key)!r}, "
-            f"not {wanted[key]!r}; choose another --out"
+            f"not {wanted.get(key)!r}; choose another --out"
         )
     return True
 
@@ -85,19 +95,20 @@ def train(arguments: argparse.Namespace) -> None:
     """`mace-rl train`."""
     config = run_config(arguments)
     if finished(config, arguments.out):
-        (arguments.out / "checkpoint.pt").unlink(missing_ok=True)  # killed between the two
+        (arguments.out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
         logger.info("%s holds this run already, finished", arguments.out)
         return
     # Imported here: PyTorch takes seconds, and a mistake in the command should not.
-    from mace_rl import run
+    from mace_rl.runs import progress, run
 
-    run.run(config, arguments.out)
-    logger.info("finished: %s", arguments.out / "episodes.csv")
+    with progress.line(sys.stderr) as observe:
+        run.run(config, arguments.out, observe)
+    logger.info("finished: %s", arguments.out / files.EPISODES)
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """`mace-rl evaluate`."""
-    from mace_rl import evaluate
+    from mace_rl.runs import evaluate
 
     if arguments.episodes < 1 or arguments.seed < 0:
         raise ConfigError("--episodes should be at least 1 and --seed at least 0")
@@ -110,7 +121,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
-    from mace_rl import verify
+    from mace_rl.runs import verify
 
     if arguments.sample is not None and arguments.sample < 1:
         raise ConfigError(f"--sample is {arguments.sample}, but should be at least 1")

@@ -1,7 +1,16 @@
-"""Writing files so that neither a crash nor a reader finds half of one."""
+"""The files of a run, and writing files so that neither a crash nor a reader finds half of one."""
 
 import os
 from pathlib import Path
+
+EPISODES = "episodes.csv"  # one row per training episode
+DIAGNOSTICS = "diagnostics.csv"  # one row per update
+AGENT = "agent.pt"  # the final weights
+RECORD = "run.json"  # configuration, versions, machine, digests; written last
+RESULTS = (EPISODES, DIAGNOSTICS, AGENT)  # what the same run has to give again, to the bit
+
+CHECKPOINT = "checkpoint.pt"  # while it runs: from which it resumes ...
+PROGRESS = "progress.json"  # ... and for whoever watches
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> None:

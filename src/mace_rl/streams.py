@@ -17,14 +17,21 @@ STREAMS = (
     "density",
     "density_batches",
     "meta",
+    "novelty",
+    "beta",
 )
 
 
-def sequence(seed: int, stream: str) -> np.random.SeedSequence:
-    """The seed sequence of `stream` (one of `STREAMS`) in the run with this `seed`."""
-    return np.random.SeedSequence(entropy=seed, spawn_key=(STREAMS.index(stream),))
+class Streams:
+    """The random streams of the run with this `seed`."""
 
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
 
-def numpy_generator(seed: int, stream: str) -> np.random.Generator:
-    """A NumPy generator for `stream`."""
-    return np.random.default_rng(sequence(seed, stream))
+    def sequence(self, stream: str) -> np.random.SeedSequence:
+        """The seed sequence of `stream`, one of `STREAMS`."""
+        return np.random.SeedSequence(entropy=self.seed, spawn_key=(STREAMS.index(stream),))
+
+    def __getitem__(self, stream: str) -> np.random.Generator:
+        """A new generator for `stream`, at its beginning."""
+        return np.random.default_rng(self.sequence(stream))

@@ -4,52 +4,35 @@
 
 One `Trainer` is one run. Each round plays whole episodes with the current policy, weighs the
 curiosity bonus of each episode with its β, updates the policy by PPO, and lets the episodes become
-memory. The phases are methods, named after the paper's terms; what they use is in the file of
-that name: `rollout`, `curiosity` (`memory`, `novelty`, `density`), `beta` (`meta_network`), `ppo`.
+memory. The phases are methods, named after the paper's terms. What they use is in the rooms of
+those names: `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta network),
+`environments`.
 """
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Discrete
 
-from mace_rl.beta import BetaController, ExponentialSchedule, MetaAdaptation
-from mace_rl.curiosity import Curiosity
-from mace_rl.environments import Environment
+from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.network import Network, network
+from mace_rl.agent.policy import Policy
+from mace_rl.agent.ppo import PPO, Batch, Update
+from mace_rl.beta.controller import BetaController
+from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.beta.schedule import ExponentialSchedule
+from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.config.plugins import make
+from mace_rl.config.run import CustomBeta, ExponentialBeta, MetaBeta, NoBonus, RunConfig
+from mace_rl.diagnostics import diagnose
+from mace_rl.environments.environment import Environment
+from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
+from mace_rl.experience import Experience, intrinsic_parts, joined, steps, total_advantages
 from mace_rl.finite import NonFiniteError, require_finite
-from mace_rl.hyperparameters import ExponentialBeta, MetaBeta, NoBonus, RunConfig
-from mace_rl.ppo import PPO, Batch
-from mace_rl.records import EPISODE_COLUMNS, Record
-from mace_rl.rollout import Episode, draw_noise, rollout_for
-from mace_rl.streams import numpy_generator
-
-
-@dataclass(frozen=True)
-class Experience:
-    """An episode with all that the update needs of it; arrays are [T]."""
-
-    episode: Episode
-    observations: np.ndarray  # float32 [T + 1, observation], normalised as the networks see them
-    beta: float
-    bonus: np.ndarray  # R_curiosity
-    extrinsic_advantages: np.ndarray
-    extrinsic_returns: np.ndarray
-    intrinsic_advantages: np.ndarray  # zeros without a bonus, like the next
-    intrinsic_returns: np.ndarray
-
-
-def beta_controller(config: RunConfig, environment: Environment) -> BetaController | None:
-    """What sets β in this variant; None for plain PPO."""
-    match config.beta:
-        case NoBonus():
-            return None
-        case ExponentialBeta():
-            return ExponentialSchedule(config.beta)
-        case MetaBeta():
-            return MetaAdaptation(config, environment)
+from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows
+from mace_rl.streams import Streams
 
 
 class Trainer:
@@ -57,15 +40,22 @@ class Trainer:
 
     def __init__(self, config: RunConfig) -> None:
         self.config = config
-        self.environment = Environment(config.environment, config.seed)
-        self.rollout = rollout_for(self.environment)
-        self.noise = numpy_generator(config.seed, "actions")
-        self.controller = beta_controller(config, self.environment)
-        self.curiosity = Curiosity(config, self.environment) if self.controller else None
-        self.ppo = PPO(config.ppo, self.environment, config.seed, self.curiosity is not None)
-        self.records: list[Record] = []
+        streams = Streams(config.seed)
+        self.environment = Environment(
+            config.environment,
+            streams.sequence("environment"),
+            config.max_episode_steps,
+            config.environment_arguments,
+        )
+        self.controller = beta_controller(config, self.environment, streams)
+        self.curiosity = curiosity(config, self.environment, streams) if self.controller else None
+        self.ppo = ppo(config, self.environment, self.curiosity is not None, streams)
+        self.rollout = rollout_for(self.environment, self.ppo.acting_policy())
+        self.noise = streams["actions"]
+        self.records: list[EpisodeRecord] = []
+        self.diagnostics: list[UpdateRecord] = []
 
-    def run(self) -> Iterator[list[Record]]:
+    def run(self) -> Iterator[list[EpisodeRecord]]:
         """Train to the last episode; yields the records of each round after its update.
 
         Raises `NonFiniteError` as soon as a number goes bad, before its round is yielded.
@@ -76,12 +66,16 @@ class Trainer:
             try:
                 rollout = self.collect()
                 updating = True
-                self.adapt(rollout)
-                self.improve(rollout)
+                credit = self.adapt(rollout)
+                update = self.improve(rollout)
+                done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
+                self.diagnostics.append(diagnose(done, rollout, update, credit))
             except NonFiniteError as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
-                done = len(self.records)
-                where = f"the update after episode {done}" if updating else f"episode {done + 1}"
+                played = len(self.records)
+                where = (
+                    f"the update after episode {played}" if updating else f"episode {played + 1}"
+                )
                 raise NonFiniteError(f"{run}, {where}: {error}") from None
             yield self.records[start:]
 
@@ -101,44 +95,46 @@ class Trainer:
     def appraise(self, episode: Episode) -> Experience:
         """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
         observations = self.ppo.normalise(episode.observations)
-        beta, bonus = 0.0, np.zeros(len(episode))
-        intrinsic = bonus, bonus
         extrinsic = self.ppo.advantages_and_returns(
             "extrinsic", observations, episode.rewards, episode.terminated
         )
+        beta, bonus = 0.0, None
+        reward = np.zeros(len(episode))
+        intrinsic = reward, reward
         if self.curiosity and self.controller:
             beta = self.controller.beta
             require_finite("β", beta)
             bonus = self.curiosity.bonus(episode)
-            require_finite("the curiosity bonus", bonus)
+            reward = bonus.reward
+            require_finite("the curiosity bonus", reward)
             intrinsic = self.ppo.advantages_and_returns(
-                "intrinsic", observations, bonus, episode.terminated
+                "intrinsic", observations, reward, episode.terminated
             )
             self.curiosity.remember(episode, extrinsic[1])
-            self.controller.next_episode(episode, bonus)
+            self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
-            Record(
+            EpisodeRecord(
                 episode=len(self.records) + 1,
                 env_steps=before + len(episode),
                 length=len(episode),
                 extrinsic_return=float(episode.rewards.sum()),
-                intrinsic_return=float(bonus.sum()),
+                intrinsic_return=float(reward.sum()),
                 beta=beta,
                 terminated=int(episode.terminated),
             )
         )
         return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic)
 
-    def adapt(self, rollout: list[Experience]) -> None:
+    def adapt(self, rollout: list[Experience]) -> float | None:
         """Meta-adaptation: tell the controller what each β changes in the update, before it.
 
         The update starts along the policy gradient of the normalised total advantage. Shown are its
         derivative with respect to each episode's β, relative to its length, and the policy gradient
-        of the extrinsic advantage.
+        of the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
         """
         if not (self.controller and self.controller.learns):
-            return
+            return None
         extrinsic = np.concatenate([item.extrinsic_advantages for item in rollout])
         total = total_advantages(rollout)
         extrinsic_gradient, update, *changes = self.ppo.policy_gradients(
@@ -150,14 +146,14 @@ class Trainer:
             ],
         )
         length = max(float(np.linalg.norm(update)), 1e-8)
-        self.controller.learn(extrinsic_gradient, [change / length for change in changes])
+        return self.controller.learn(extrinsic_gradient, [change / length for change in changes])
 
-    def improve(self, rollout: list[Experience]) -> None:
+    def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
         if self.curiosity:
             returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
-        norms = self.ppo.update(
+        update = self.ppo.update(
             Batch(
                 *steps(rollout),
                 log_probs=joined([item.episode.log_probs for item in rollout]),
@@ -165,27 +161,14 @@ class Trainer:
                 returns=returns,
             )
         )
-        for name, norm in norms.items():
+        for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
-        for name, learner in self.ppo.learners.items():
-            require_finite(f"a weight of the {name}", learner.parameters)
+        for name, adam in self.ppo.optimisers.items():
+            require_finite(f"a weight of the {name}", adam.parameters)
         for item in rollout:
-            self.ppo.standardiser.update(item.episode.observations[:-1])
-
-    def agent(self) -> dict[str, Any]:
-        """The policy and critics as they are now, with the observation normaliser."""
-        networks = {"actor": self.ppo.actor} | self.ppo.critics
-        return {
-            "networks": {
-                name: {
-                    "sizes": network.sizes.tolist(),
-                    "parameters": torch.from_numpy(network.parameters.copy()),
-                }
-                for name, network in networks.items()
-            },
-            "standardiser": self.ppo.standardiser.state_dict(),
-        }
+            self.ppo.normaliser.update(item.episode.observations[:-1])
+        return update
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the rest of the run depends on, at the end of a round."""
@@ -195,13 +178,8 @@ class Trainer:
             "controller": self.controller.state_dict() if self.controller else None,
             "noise": self.noise.bit_generator.state,
             "environment": self.environment.generator.bit_generator.state,
-            "records": {
-                name: torch.tensor(
-                    [getattr(record, name) for record in self.records],
-                    dtype=torch.float64 if kind is float else torch.int64,
-                )
-                for name, kind in EPISODE_COLUMNS.items()
-            },
+            "records": as_tensors(as_columns(EpisodeRecord, self.records)),
+            "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -212,58 +190,48 @@ class Trainer:
             self.controller.load_state_dict(state["controller"])
         self.noise.bit_generator.state = state["noise"]
         self.environment.generator.bit_generator.state = state["environment"]
-        columns = {name: column.tolist() for name, column in state["records"].items()}
-        self.records = [
-            Record(**dict(zip(columns, row, strict=True)))
-            for row in zip(*columns.values(), strict=True)
-        ]
+        self.records = as_rows(EpisodeRecord, state["records"])
+        self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
 
 
-def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
-    """Observations, [N, observation], and actions of the episodes, one after the other."""
-    observations = np.concatenate([item.observations[:-1] for item in rollout])
-    return observations, np.concatenate([item.episode.actions for item in rollout])
+def as_tensors(columns: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    """For a checkpoint."""
+    return {name: torch.from_numpy(column) for name, column in columns.items()}
 
 
-def joined(pieces: list[np.ndarray]) -> np.ndarray:
-    """The episodes' arrays one after the other, float32 [N]."""
-    return np.concatenate(pieces).astype(np.float32)
+def beta_controller(
+    config: RunConfig, environment: Environment, streams: Streams
+) -> BetaController | None:
+    """What sets β in this variant; None for plain PPO."""
+    match config.beta:
+        case NoBonus():
+            return None
+        case ExponentialBeta():
+            return ExponentialSchedule(config.beta)
+        case MetaBeta(initial=initial):
+            size, actions = environment.observation_size, environment.action_space
+            generator = streams["meta"]
+            return MetaAdaptation(config.meta, initial, config.engine, size, actions, generator)
+        case CustomBeta(rule=rule, arguments=arguments):
+            return make(rule, "beta.rule", streams["beta"], **arguments)
 
 
-def total_advantages(rollout: list[Experience]) -> np.ndarray:
-    """A_E + β A_I of every step, float64 [N]."""
-    return np.concatenate(
-        [item.extrinsic_advantages + item.beta * item.intrinsic_advantages for item in rollout]
-    )
+def curiosity(config: RunConfig, environment: Environment, streams: Streams) -> Curiosity:
+    """The curiosity bonus with its memory and novelty."""
+    space, size = environment.observation_space, environment.observation_size
+    return Curiosity(config.memory, config.novelty, config.engine, space, size, streams)
 
 
-def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
-    """For each episode what `total_advantages` changes by with its β: A_I there, 0 elsewhere."""
-    parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
-    start = 0
-    for part, item in zip(parts, rollout, strict=True):
-        part[start : start + len(item.episode)] = item.intrinsic_advantages
-        start += len(item.episode)
-    return list(parts)
+def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:
+    """Policy and critics, one for each kind of reward."""
+    space, size = environment.action_space, environment.observation_size
 
+    def new(outputs: int, output_gain: float, stream: str) -> Network:
+        return network(config.ppo, config.engine, size, outputs, output_gain, streams[stream])
 
-def normalised(advantages: np.ndarray) -> np.ndarray:
-    """Advantages with mean 0 and standard deviation 1, [N]."""
-    centred = advantages - advantages.mean()
-    return centred / (root_mean_square(centred) + 1e-8)
-
-
-def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """d normalised(advantages + ε · change) / dε at ε = 0, [N].
-
-    What of the change is parallel to the advantages is lost in the normalisation.
-    """
-    centred, change = advantages - advantages.mean(), change - change.mean()
-    spread = root_mean_square(centred) + 1e-8
-    direction = centred / spread
-    return (change - direction * (direction @ change / len(change))) / spread
-
-
-def root_mean_square(values: np.ndarray) -> float:
-    """√(Σ x² / N)."""
-    return math.sqrt(values @ values / len(values))
+    actions = int(space.n) if isinstance(space, Discrete) else space.shape[0]
+    # A small last layer starts near the uniform policy, or at means near 0.
+    policy = Policy(new(actions, 0.01, "actor"), space, config.ppo.initial_log_std)
+    kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
+    critics = {kind: new(1, 1.0, f"{kind}_critic") for kind in kinds}
+    return PPO(config.ppo, policy, critics, size, streams["minibatches"])

@@ -1,4 +1,4 @@
-# The paper's figure, drawn from its data alone.
+# Figures over training, each drawn from its data alone: 1 is the paper's, 2 shows β.
 
 
 rule curves:
@@ -6,33 +6,39 @@ rule curves:
         EPISODES,
     output:
         curves=report(
-            f"{RESULTS}/figure1.csv", caption="../report/figure1_data.rst", category="Results"
+            f"{RESULTS}/figure{{number}}.csv", caption="../report/curves.rst", category="Results"
         ),
-        single_seeds=f"{RESULTS}/figure1_seeds.csv",
+        single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
     log:
-        f"{RESULTS}/logs/curves.log",
+        f"{RESULTS}/logs/curves{{number}}.log",
+    wildcard_constraints:
+        number="1|2",
     params:
         runs=BUDGETS,
-        settings=study.metrics.model_dump(),
+        settings=study.metrics.model_dump(exclude={"custom"}),
         code=code("curves.py"),
     script:
         "../scripts/curves.py"
 
 
-rule figure1:
+rule figure:
     input:
-        curves=f"{RESULTS}/figure1.csv",
-        single_seeds=f"{RESULTS}/figure1_seeds.csv",
+        curves=f"{RESULTS}/figure{{number}}.csv",
+        single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
     output:
-        pdf=f"{RESULTS}/figure1.pdf",
-        png=report(f"{RESULTS}/figure1.png", caption="../report/figure1.rst", category="Results"),
+        pdf=f"{RESULTS}/figure{{number}}.pdf",
+        png=report(
+            f"{RESULTS}/figure{{number}}.png", caption="../report/figure.rst", category="Results"
+        ),
     log:
-        f"{RESULTS}/logs/figure1.log",
+        f"{RESULTS}/logs/figure{{number}}.log",
+    wildcard_constraints:
+        number="1|2",
     params:
         layout=study.figure.model_dump(),
-        settings=study.metrics.model_dump(),
-        labels=selected(study.labels),
-        colours=selected(study.colours),
-        code=code("figure1.py"),
+        settings=study.metrics.model_dump(exclude={"custom"}),
+        labels=study.labels,
+        colours=study.colours,
+        code=code("figure.py"),
     script:
-        "../scripts/figure1.py"
+        "../scripts/figure.py"

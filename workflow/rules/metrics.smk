@@ -1,5 +1,12 @@
 # What is measured on each run, one row per run.
 
+from mace_rl.results.metrics import all_metrics
+
+try:
+    all_metrics(study.metrics)  # the user's own among them: are they metrics?
+except ConfigError as error:
+    sys.exit(f"Error in the configuration: {origin}: {error}")
+
 
 rule metrics:
     input:
@@ -14,6 +21,6 @@ rule metrics:
         variants=study.variants,
         seeds=study.seeds,
         settings=study.metrics.model_dump(),
-        code=code("metrics.py"),
+        code=code("metrics.py", study.metrics),
     script:
         "../scripts/metrics.py"

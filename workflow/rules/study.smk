@@ -8,18 +8,21 @@ from itertools import product
 from pathlib import Path
 
 import gymnasium
-from mace_rl import provenance
-from mace_rl.hyperparameters import ConfigError
+from mace_rl import files
+from mace_rl.config.reading import merge, read_yaml, typed
+from mace_rl.config.section import ConfigError
+from mace_rl.config.study import load_study
+from mace_rl.config.plugins import source_file
+from mace_rl.runs import provenance
 from mace_rl.sources import digest
-from mace_rl.study import load_study, merge, read_yaml, typed
 
 # Snakemake pastes this path into the shell commands of `script:` jobs, where a space would split it.
 sys.executable = shlex.quote(sys.executable)
 
 try:
-    files = [os.path.relpath(file) for file in workflow.configfiles]
-    origin = " + ".join(files[-1:] + files[:-1])  # Snakemake lists its own config.yaml last
-    for file in files:
+    paths = [os.path.relpath(file) for file in workflow.configfiles]
+    origin = " + ".join(paths[-1:] + paths[:-1])  # Snakemake lists its own config.yaml last
+    for file in paths:
         read_yaml(Path(file))  # sees what Snakemake's reader does not: a key that occurs twice
     # Snakemake takes the numbers in `--config seeds=[0,1]` for text.
     given = {key: typed(value) for key, value in workflow.config_settings.config.items()}
@@ -30,7 +33,7 @@ except ConfigError as error:
 RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = list(product(study.environments, study.variants, study.seeds))
-EPISODES = [f"{RUN}/episodes.csv".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
+EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
 BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
 
 
@@ -53,20 +56,19 @@ def run_config(wildcards):
 def most_work(wildcards):
     """A measure of how long a run can take: long ones start first, and no core idles at the end."""
     config = run_config(wildcards)
-    steps = config.episodes * gymnasium.registry[config.environment].max_episode_steps
+    own_limit = gymnasium.registry[config.environment.rpartition(":")[2]].max_episode_steps
+    steps = config.episodes * (config.max_episode_steps or own_limit)
     return steps if config.beta.kind == "none" else 2 * steps
 
 
-def selected(by_variant):
-    """The entries of the selected variants only: no other can call for a new table or figure."""
-    return {variant: by_variant[variant] for variant in study.variants}
-
-
-def code(script):
+def code(script, config=None):
     """Digest of a script and of all that it imports of mace_rl, for the `params:` of its rule.
 
-    That makes a change of code, by content, a reason to run the job again. As an input it would
-    not: Snakemake goes by an input's time stamp first, and records what it contained when the job
-    ended, so code that was edited meanwhile would pass for the code that ran.
+    With a run's `config`, of the user's code that the run names, too. That makes a change of code,
+    by content, a reason to run the job again. As an input it would not: Snakemake goes by an input's
+    time stamp first, and records what it contained when the job ended, so code that was edited
+    meanwhile would pass for the code that ran.
     """
-    return digest(Path(workflow.basedir, "workflow", "scripts", script))
+    named = config.references() if config else {}
+    own = [source_file(reference, key) for key, reference in named.items()]
+    return digest(Path(workflow.basedir, "workflow", "scripts", script), *own)

@@ -1,4 +1,4 @@
-# The paper's tables.
+# The paper's tables, and whether their differences are more than chance.
 
 
 rule table1:
@@ -20,10 +20,31 @@ rule table1:
         variants=study.variants,
         seeds=study.seeds,
         settings=study.metrics.model_dump(),
-        labels=selected(study.labels),
-        code=code("table1.py"),
+        labels=study.labels,
+        code=code("table1.py", study.metrics),
     script:
         "../scripts/table1.py"
+
+
+rule comparisons:
+    input:
+        f"{RESULTS}/metrics.csv",
+    output:
+        report(
+            f"{RESULTS}/comparisons.csv",
+            caption="../report/comparisons.rst",
+            category="Supplement",
+        ),
+    log:
+        f"{RESULTS}/logs/comparisons.log",
+    params:
+        environments=study.environments,
+        variants=study.variants,
+        seeds=study.seeds,
+        settings=study.metrics.model_dump(),
+        code=code("comparisons.py", study.metrics),
+    script:
+        "../scripts/comparisons.py"
 
 
 rule table2:

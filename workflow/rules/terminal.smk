@@ -2,33 +2,13 @@
 
 import fcntl
 import platform
+from types import SimpleNamespace
 
 from snakemake.logging import logger
-from snakemake_interface_logger_plugins.common import LogEvent
-
-from mace_rl import progress
+from snakemake_logger_plugin_mace_rl import Run, Study
 
 # A job ends when the Snakemake that started it does, even by SIGKILL: workflow/scripts/job.py.
 os.environ.update(MACE_RL_SNAKEMAKE_PID=str(os.getpid()))
-
-# What Snakemake says of each job when all goes well; it stays in the log that is named at the end.
-ROUTINE = {
-    LogEvent.JOB_INFO,
-    LogEvent.JOB_STARTED,
-    LogEvent.JOB_FINISHED,
-    LogEvent.PROGRESS,
-    LogEvent.RESOURCES_INFO,
-}
-
-
-def of_interest(record):
-    message = str(record.msg)
-    return not (
-        getattr(record, "event", None) in ROUTINE
-        or message.startswith("Select jobs to execute")
-        # The script of the job has said why, and Snakemake goes on to say which job it was.
-        or message.endswith(("returned non-zero exit status 1.", "exit status 130."))
-    )
 
 
 def occupy(folder):
@@ -52,35 +32,18 @@ def occupy(folder):
 
 
 def watched_runs():
-    """Every run of the study; those that this Snakemake is to carry out are due."""
-    due = {job.output.record for job in workflow.dag.needrun_jobs() if job.rule.name == "train"}
+    """Every run of the study, as what the terminal shows needs it."""
     for env, variant, seed, episodes in BUDGETS:
-        folder = RUN.format(env=env, variant=variant, seed=seed)
-        yield progress.Run(env, variant, seed, episodes, folder, f"{folder}/run.json" in due)
-
-
-def stop_monitor():
-    if monitor:
-        progress.stop(monitor)
-
-
-monitor = None
+        wildcards = {"env": env, "variant": variant, "seed": str(seed)}
+        work = most_work(SimpleNamespace(**wildcards))
+        yield Run(*wildcards.values(), episodes, work, RUN.format(**wildcards))
 
 
 onstart:
-    global lock, monitor
+    global lock
     lock = occupy(RESULTS)
-    for handler in logger.handlers:
-        if handler.name == "DefaultStreamHandler":
-            handler.addFilter(of_interest)
-    runs = list(watched_runs())
-    if any(run.due for run in runs):
-        monitor = progress.start(runs, workflow.cores or 1, workflow.local_exec)
-
-
-onsuccess:
-    stop_monitor()
-
-
-onerror:
-    stop_monitor()
+    # Snakemake tells its loggers how many jobs there will be, but not which.
+    jobs = [job for job in workflow.dag.needrun_jobs() if job.rule.name == "train"]
+    due = [tuple(job.wildcards_dict.values()) for job in jobs]
+    watched = Study(watched_runs(), due, workflow.cores if workflow.local_exec else None)
+    logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra={"study": watched})

@@ -3,9 +3,10 @@
 
 rule train:
     output:
-        episodes=f"{RUN}/episodes.csv",
-        record=f"{RUN}/run.json",
-        agent=f"{RUN}/agent.pt",
+        episodes=f"{RUN}/{files.EPISODES}",
+        diagnostics=f"{RUN}/{files.DIAGNOSTICS}",
+        agent=f"{RUN}/{files.AGENT}",
+        record=f"{RUN}/{files.RECORD}",
     log:
         f"{RESULTS}/logs/train/{{env}}/{{variant}}/seed{{seed}}.log",
     benchmark:
@@ -16,8 +17,8 @@ rule train:
         mem_mb=1000,
         runtime=1440,
     params:
-        config=lambda wildcards: run_config(wildcards).model_dump(),
-        code=code("train.py"),
+        config=lambda wildcards: run_config(wildcards).settings(),
+        code=lambda wildcards: code("train.py", run_config(wildcards)),
         versions=provenance.versions(),
     script:
         "../scripts/train.py"

@@ -1,8 +1,8 @@
-"""What a job does around its work: all output goes to its log, the reason of a failure also to the
-terminal."""
+"""What a job does around its work: all output goes to its log, and what went wrong in one line."""
 
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -19,10 +19,10 @@ def job(title: str, log: str) -> Iterator[None]:
     """Carry out the body as the job `title`.
 
     Standard output and error, those of compiled libraries too, are appended to the file `log`. If
-    the body raises, the traceback goes there, a line to the terminal, and the process exits with 1.
+    the body raises, the process exits with 1, and there too are the traceback and, in a line that
+    src/snakemake_logger_plugin_mace_rl shows, the reason.
     """
     _end_with_snakemake()
-    terminal = os.dup(2)
     with open(log, "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -30,16 +30,20 @@ def job(title: str, log: str) -> Iterator[None]:
         stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(message)s", force=True
     )
     logger.info("%s: started as process %d", title, os.getpid())
+
+    def interrupted(*_: object) -> None:
+        os.write(2, f"{title}: interrupted\n".encode())
+        os._exit(130)
+
+    # An ordinary KeyboardInterrupt is lost if numba happens to compile; results are written
+    # atomically and runs resume, so there is nothing to put in order.
+    signal.signal(signal.SIGINT, interrupted)
     start = time.monotonic()
     try:
         yield
-    except KeyboardInterrupt:
-        logger.info("%s: interrupted", title)
-        sys.exit(130)
     except Exception as error:
-        logger.exception("%s: failed", title)
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        os.write(terminal, f"{title} failed: {reason} (more in {log})\n".encode())
+        logger.exception("%s failed: %s", title, reason)
         sys.exit(1)
     logger.info("%s: done in %.1f s", title, time.monotonic() - start)
 

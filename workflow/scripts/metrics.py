@@ -3,9 +3,10 @@
 from job import job
 
 with job("metrics", snakemake.log[0]):
+    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.metrics import MetricsConfig, metrics_table
-    from mace_rl.records import read_episodes
+    from mace_rl.results.metrics import metrics_table
+    from mace_rl.results.records import read_episodes
 
     params = snakemake.params
     runs = {

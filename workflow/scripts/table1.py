@@ -3,17 +3,20 @@
 from job import job
 
 with job("Table 1", snakemake.log[0]):
-    from mace_rl import tables
+    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.metrics import MetricsConfig, read_metrics
+    from mace_rl.results import tables
+    from mace_rl.results.metrics import read_metrics
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    metrics = read_metrics(snakemake.input[0], params.environments, params.variants, params.seeds)
+    metrics = read_metrics(
+        snakemake.input[0], params.environments, params.variants, params.seeds, settings
+    )
     for name, data, latex in (
         ("table1", tables.table1, tables.table1_latex),
         ("supplement", tables.supplement, tables.supplement_latex),
     ):
         table = data(metrics, settings)
         write_atomically(output[f"{name}_data"], table.to_csv(index=False))
-        write_atomically(output[name], latex(table, params.labels, settings.confidence))
+        write_atomically(output[name], latex(table, params.labels, settings))

@@ -6,7 +6,7 @@ from job import job
 
 run_of = snakemake.wildcards
 with job(f"training {run_of.env}, {run_of.variant}, seed {run_of.seed}", snakemake.log[0]):
-    from mace_rl.hyperparameters import RunConfig
-    from mace_rl.run import run
+    from mace_rl.config.run import RunConfig
+    from mace_rl.runs.run import run
 
     run(RunConfig.model_validate(snakemake.params.config), Path(snakemake.output.episodes).parent)

@@ -1,0 +1,1 @@
+"""The PPO agent: policy, critics, their networks and the update."""

@@ -1,0 +1,45 @@
+"""Advantages: how much better an action was than the policy's average."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def generalised_advantages(rewards, values, discount, gae_lambda):
+    """Generalised advantage estimation over one episode (Schulman et al. 2016, eq. 16).
+
+    rewards: [T]; values: [T + 1], V(s_0) … V(s_T), where V(s_T) is 0 if s_T is terminal and the
+    critic's value if the time limit cut the episode off. Returns float64 [T]; adding values[:T]
+    gives the λ-returns.
+    """
+    result = np.empty(len(rewards))
+    following = 0.0
+    for t in range(len(rewards) - 1, -1, -1):
+        delta = rewards[t] + discount * values[t + 1] - values[t]
+        following = delta + discount * gae_lambda * following
+        result[t] = following
+    return result
+
+
+def normalised(advantages: np.ndarray) -> np.ndarray:
+    """Advantages with mean 0 and standard deviation 1, [N]."""
+    centred = advantages - advantages.mean()
+    return centred / (root_mean_square(centred) + 1e-8)
+
+
+def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """d normalised(advantages + ε · change) / dε at ε = 0, [N].
+
+    What of the change is parallel to the advantages is lost in the normalisation.
+    """
+    centred, change = advantages - advantages.mean(), change - change.mean()
+    spread = root_mean_square(centred) + 1e-8
+    direction = centred / spread
+    return (change - direction * (direction @ change / len(change))) / spread
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """√(Σ x² / N)."""
+    return math.sqrt(values @ values / len(values))

@@ -1,0 +1,221 @@
+"""Networks: one small interface, the vector-Jacobian product, and two implementations.
+
+A `torch.nn.Module` defines each network. `TorchNetwork` runs any such module; `CompiledMLP` runs
+the default one, a tanh network, in compiled code. Whoever holds a network sees a flat vector of
+parameters, outputs, and gradients, and cannot tell which it is.
+"""
+
+from itertools import pairwise
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+
+from mace_rl.agent import kernels
+from mace_rl.config.plugins import make
+from mace_rl.config.run import PPOConfig, TorchModule
+from mace_rl.config.section import ConfigError
+
+
+class Trace(NamedTuple):
+    """What a forward pass leaves for the backward pass."""
+
+    outputs: np.ndarray  # float32 [N, out]
+    saved: Any  # of the network's own
+
+
+class Network(Protocol):
+    """A function of inputs and parameters with its vector-Jacobian product."""
+
+    parameters: np.ndarray  # float32 [n]; whoever learns changes it in place
+
+    def forward(self, inputs: np.ndarray) -> Trace:
+        """Outputs for inputs, [N, in] → `Trace` with [N, out]."""
+
+    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
+        """Gradient of a loss with respect to `parameters`, float32 [n].
+
+        trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
+        """
+
+    def move_to(self, memory: np.ndarray) -> None:
+        """Keep the parameters in `memory`, float32 [n], from now on."""
+
+    def module(self) -> torch.nn.Module:
+        """The same network as a torch module; it may share memory with this one."""
+
+    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over the parameters in the `state_dict` of such a module."""
+
+
+class TorchNetwork:
+    """Any torch module; its parameters become views of the flat vector."""
+
+    def __init__(self, module: torch.nn.Module) -> None:
+        self._module = module
+        vector = torch.nn.utils.parameters_to_vector(module.parameters())
+        self.move_to(vector.detach().numpy().copy())
+
+    def forward(self, inputs: np.ndarray) -> Trace:
+        """See `Network`."""
+        outputs = self._module(torch.from_numpy(np.ascontiguousarray(inputs, np.float32)))
+        return Trace(outputs.detach().numpy(), outputs)
+
+    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
+        """See `Network`."""
+        gradients = torch.autograd.grad(
+            trace.saved,
+            list(self._module.parameters()),
+            torch.from_numpy(grad_outputs),
+            retain_graph=True,
+            materialize_grads=True,
+        )
+        return torch.cat([gradient.ravel() for gradient in gradients]).numpy()
+
+    def move_to(self, memory: np.ndarray) -> None:
+        """See `Network`."""
+        vector = torch.from_numpy(memory)
+        vector.copy_(torch.nn.utils.parameters_to_vector(self._module.parameters()).detach())
+        torch.nn.utils.vector_to_parameters(vector, self._module.parameters())  # as views
+        self.parameters = memory
+
+    def module(self) -> torch.nn.Module:
+        """See `Network`."""
+        return self._module
+
+    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
+        """See `Network`."""
+        self._module.load_state_dict(state)
+
+
+class CompiledMLP:
+    """The tanh network of `mlp` in compiled code.
+
+    `parameters` is for each layer the weights, [in, out] row by row, then the biases, [out].
+    """
+
+    def __init__(self, module: torch.nn.Sequential) -> None:
+        shapes = [layer.weight.shape for layer in module if isinstance(layer, torch.nn.Linear)]
+        self.sizes = np.array([shapes[0][1], *(shape[0] for shape in shapes)])
+        count = sum(inputs * outputs + outputs for outputs, inputs in shapes)
+        self.parameters = np.empty(count, np.float32)
+        self.load_module_state(module.state_dict())
+
+    def forward(self, inputs: np.ndarray) -> Trace:
+        """See `Network`."""
+        inputs = np.ascontiguousarray(inputs, self.parameters.dtype)
+        shapes = [(len(inputs), size) for size in self.sizes.tolist()[1:]]
+        activations = (inputs, *(np.empty(shape, inputs.dtype) for shape in shapes))
+        kernels.network_outputs(activations, self.parameters, self.sizes)
+        return Trace(activations[-1], activations)
+
+    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
+        """See `Network`."""
+        return kernels.network_gradient(trace.saved, grad_outputs, self.parameters, self.sizes)
+
+    def move_to(self, memory: np.ndarray) -> None:
+        """See `Network`."""
+        memory[:] = self.parameters
+        self.parameters = memory
+
+    def layers(self, flat: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Views of a vector like `parameters`: each layer's weights, [in, out], and biases."""
+        views, start = [], 0
+        for inputs, outputs in pairwise(self.sizes.tolist()):
+            end = start + inputs * outputs
+            views.append((flat[start:end].reshape(inputs, outputs), flat[end : end + outputs]))
+            start = end + outputs
+        return views
+
+    def module(self) -> torch.nn.Sequential:
+        """See `Network`."""
+        module = tanh_layers(self.sizes.tolist())
+        linear = [layer for layer in module if isinstance(layer, torch.nn.Linear)]
+        with torch.no_grad():
+            for layer, (weights, biases) in zip(linear, self.layers(self.parameters), strict=True):
+                layer.weight.copy_(torch.from_numpy(weights.T))
+                layer.bias.copy_(torch.from_numpy(biases))
+        return module
+
+    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
+        """See `Network`."""
+        for place, (weights, biases) in enumerate(self.layers(self.parameters)):
+            weights[:] = state[f"{2 * place}.weight"].numpy().T
+            biases[:] = state[f"{2 * place}.bias"].numpy()
+
+
+def network(
+    config: PPOConfig,
+    engine: str,
+    inputs: int,
+    outputs: int,
+    output_gain: float,
+    generator: np.random.Generator,
+) -> Network:
+    """A network as the settings ask for it, newly initialised; `output_gain`: see `mlp`."""
+    if isinstance(config.network, TorchModule):
+        return TorchNetwork(custom_module(config, inputs, outputs, generator))
+    module = mlp([inputs, *config.hidden_units, outputs], output_gain, generator)
+    return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
+
+
+def custom_module(
+    config: PPOConfig, inputs: int, outputs: int, generator: np.random.Generator
+) -> torch.nn.Module:
+    """The user's own module; what it draws from torch's global generator comes from `generator`.
+
+    Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
+    are not [N, outputs] or not the same twice: such a run would not resume to the bit.
+    """
+    settings = config.network
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(generator.integers(2**63)))
+        module: torch.nn.Module = make(
+            settings.module,
+            "ppo.network.module",
+            *(inputs, outputs, config.hidden_units),
+            **settings.arguments,
+        )
+        trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
+        shapes = [tuple(module(trial).shape), (2, outputs)]
+        same = torch.equal(module(trial), module(trial))
+    for problem, found in {
+        f"gives {shapes[0]} for inputs (2, {inputs}), not {shapes[1]}": shapes[0] != shapes[1],
+        "keeps state besides its parameters (buffers)": any(True for _ in module.buffers()),
+        "gives other outputs the second time (dropout?)": not same,
+    }.items():
+        if found:
+            raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
+    return module.float()
+
+
+def mlp(
+    sizes: list[int], output_gain: float, generator: np.random.Generator
+) -> torch.nn.Sequential:
+    """Linear layers with tanh between them: what `CompiledMLP` computes, in torch.
+
+    Initial weights are orthogonal with gain √2, `output_gain` in the last layer; biases are 0.
+    """
+    module = tanh_layers(sizes)
+    linear = [layer for layer in module if isinstance(layer, torch.nn.Linear)]
+    with torch.no_grad():
+        for layer in linear:
+            gain = output_gain if layer is linear[-1] else np.sqrt(2)
+            weights = gain * orthogonal((layer.in_features, layer.out_features), generator)
+            layer.weight.copy_(torch.from_numpy(weights.T))
+            layer.bias.zero_()
+    return module
+
+
+def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
+    """The layers of `mlp`, with weights that mean nothing."""
+    linear = [torch.nn.utils.skip_init(torch.nn.Linear, *pair) for pair in pairwise(sizes)]
+    return torch.nn.Sequential(*(part for one in linear for part in (one, torch.nn.Tanh())))[:-1]
+
+
+def orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
+    """A random matrix with orthonormal rows or columns (Saxe et al. 2014)."""
+    rows, columns = max(shape), min(shape)
+    basis, triangle = np.linalg.qr(generator.standard_normal((rows, columns)))
+    basis *= np.sign(np.diag(triangle))  # else not uniform over the orthogonal matrices
+    return basis if shape == (rows, columns) else basis.T

@@ -1,0 +1,206 @@
+"""Proximal Policy Optimization (Schulman et al. 2017) with one critic per kind of reward."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mace_rl.agent import kernels
+from mace_rl.agent.adam import Adam
+from mace_rl.agent.advantages import generalised_advantages
+from mace_rl.agent.network import Network
+from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.agent.policy import ActingPolicy, Policy
+from mace_rl.config.run import PPOConfig
+
+# Steps that go through a network at once in an update. Arrays for many more would not fit into the
+# processor's cache, and the system takes back their memory after each use: a quarter more time for
+# 2048 steps.
+BLOCK = 512
+OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one update learns from: N steps of whole episodes, one after the other."""
+
+    observations: np.ndarray  # float32 [N, observation], normalised
+    actions: np.ndarray  # int64 [N] or float32 [N, actions]
+    log_probs: np.ndarray  # float32 [N], when the actions were taken
+    advantages: np.ndarray  # float32 [N], of the total reward, normalised
+    returns: dict[str, np.ndarray]  # for each critic the λ-returns it learns, float32 [N]
+
+    def __len__(self) -> int:
+        return len(self.log_probs)
+
+    def __getitem__(self, index: Any) -> "Batch":
+        """Some of the steps."""
+        return Batch(
+            self.observations[index],
+            self.actions[index],
+            self.log_probs[index],
+            self.advantages[index],
+            {kind: returns[index] for kind, returns in self.returns.items()},
+        )
+
+    def blocks(self) -> Iterator["Batch"]:
+        """All steps in order, `BLOCK` at a time."""
+        return (self[start : start + BLOCK] for start in range(0, len(self), BLOCK))
+
+
+@dataclass
+class Update:
+    """What an update tells of itself."""
+
+    gradient_norms: dict[str, float]  # of the last minibatch, before clipping, by network
+    # Means over the steps of the last epoch, each as its minibatch was learnt from.
+    approximate_kl: float = 0.0  # of the policy to the one that acted
+    clip_fraction: float = 0.0  # of the ratios outside the clipping bounds
+    entropy: float = 0.0  # of the policy, nats
+
+
+class PPO:
+    """Policy and critics with their optimisers, and the update.
+
+    The total reward R_E + β R_I is a sum, so its advantage is A_E + β A_I with a value function
+    for each part: "extrinsic" always, "intrinsic" with a curiosity bonus. The parts share no
+    weights: the bonus can reach the extrinsic critic in no way, and the actor only through β.
+    """
+
+    def __init__(
+        self,
+        config: PPOConfig,
+        policy: Policy,
+        critics: Mapping[str, Network],
+        observation_size: int,
+        generator: np.random.Generator,
+    ) -> None:
+        self.config = config
+        self.policy = policy
+        self.critics = dict(critics)  # each with one output
+        self.optimisers = {
+            "actor": Adam(policy.parameters, config.actor_learning_rate, config.max_gradient_norm)
+        } | {
+            kind: Adam(critic.parameters, config.critic_learning_rate, config.max_gradient_norm)
+            for kind, critic in critics.items()
+        }
+        self.normaliser = RunningNormaliser(observation_size)
+        self.minibatches = generator
+
+    def normalise(self, observations: np.ndarray) -> np.ndarray:
+        """What the networks see of `observations`, float32 [N, observation]."""
+        if not self.config.normalise_observations:
+            return observations
+        return np.clip(self.normaliser(observations), -OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+    def normalisation(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Mean and standard deviation of observations, [observation], and the normalised's bound.
+
+        What leaves observations as they are if they are not to be normalised.
+        """
+        if self.config.normalise_observations:
+            return self.normaliser.mean, self.normaliser.std, OBSERVATION_CLIP
+        size = len(self.normaliser.mean)
+        return np.zeros(size), np.ones(size), np.inf
+
+    def acting_policy(self) -> ActingPolicy:
+        """The current policy for a rollout."""
+        return self.policy.for_acting(*self.normalisation())
+
+    def advantages_and_returns(
+        self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
+
+        observations: normalised, [T + 1, observation]. A terminal state is worth 0; a state the
+        time limit cut off at is worth what the critic says.
+        """
+        values = self.critics[kind].forward(observations).outputs[:, 0].astype(np.float64)
+        if terminated:
+            values[-1] = 0.0
+        advantages = generalised_advantages(
+            rewards, values, self.config.discount, self.config.gae_lambda
+        )
+        return advantages, advantages + values[:-1]
+
+    def update(self, batch: Batch) -> Update:
+        """K epochs over `batch`."""
+        for _ in range(self.config.epochs):
+            update = Update({})
+            for minibatch in self._minibatches(batch):
+                share = len(minibatch) / len(batch)
+                gradient, kl, clipped, entropy = self.actor_gradient(minibatch)
+                update.approximate_kl += share * kl
+                update.clip_fraction += share * clipped
+                update.entropy += share * entropy
+                update.gradient_norms["actor"] = self.optimisers["actor"].step(gradient)
+                for kind in self.critics:
+                    gradient = self.critic_gradient(kind, minibatch)
+                    update.gradient_norms[kind] = self.optimisers[kind].step(gradient)
+        return update
+
+    def actor_gradient(self, batch: Batch) -> tuple[np.ndarray, float, float, float]:
+        """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
+
+        Also the batch's approximate KL divergence, clip fraction and entropy, as in `Update`.
+        """
+        total: np.ndarray | None = None
+        sums = np.zeros(3)
+        for steps in batch.blocks():
+            trace = self.policy.forward(steps.observations)
+            log_probs = self.policy.log_probs(trace.outputs, steps.actions)
+            weights, divergence, outside = kernels.surrogate_weights(
+                log_probs, steps.log_probs, steps.advantages, self.config.clip
+            )
+            gradient, entropy = self.policy.gradient(
+                trace, steps.actions, weights, self.config.entropy_coefficient
+            )
+            total = gradient if total is None else total + gradient
+            sums += divergence, outside, entropy
+        return -(total / np.float32(len(batch))), *(sums / len(batch)).tolist()
+
+    def critic_gradient(self, kind: str, batch: Batch) -> np.ndarray:
+        """Gradient of the mean squared error of a critic's V(s) against the λ-returns."""
+        critic = self.critics[kind]
+        total: np.ndarray | None = None
+        for steps in batch.blocks():
+            trace = critic.forward(steps.observations)
+            errors = trace.outputs - steps.returns[kind][:, None]
+            gradient = critic.backward(trace, 2 * errors)
+            total = gradient if total is None else total + gradient
+        return total / np.float32(len(batch))
+
+    def policy_gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
+        trace = self.policy.forward(observations)
+        return [
+            self.policy.gradient(trace, actions, (item / len(item)).astype(trace.outputs.dtype))[0]
+            for item in advantages
+        ]
+
+    def _minibatches(self, batch: Batch) -> Iterator[Batch]:
+        """The minibatches of one epoch; the whole batch in order if none are asked for."""
+        if self.config.minibatch_size is None:
+            yield batch
+            return
+        order = self.minibatches.permutation(len(batch))
+        for start in range(0, len(batch), self.config.minibatch_size):
+            yield batch[order[start : start + self.config.minibatch_size]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, optimisers, normaliser and generator."""
+        return {
+            "optimisers": {name: adam.state_dict() for name, adam in self.optimisers.items()},
+            "normaliser": self.normaliser.state_dict(),
+            "minibatches": self.minibatches.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        for name, adam in self.optimisers.items():
+            adam.load_state_dict(state["optimisers"][name])
+        self.normaliser.load_state_dict(state["normaliser"])
+        self.minibatches.bit_generator.state = state["minibatches"]

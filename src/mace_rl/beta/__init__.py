@@ -1,0 +1,1 @@
+"""What sets β, the weight of the curiosity bonus, episode by episode."""

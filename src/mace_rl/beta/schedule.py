@@ -1,0 +1,34 @@
+"""Schedules of β, which follow the episode's number alone."""
+
+from typing import Any
+
+import numpy as np
+
+from mace_rl.beta.controller import BetaController
+from mace_rl.config.run import ExponentialBeta
+from mace_rl.environments.rollout import Episode
+
+
+class ExponentialSchedule(BetaController):
+    """β_n = max(floor, initial · decay^(n-1)): the paper's ablation with a fixed schedule."""
+
+    def __init__(self, config: ExponentialBeta) -> None:
+        self.config = config
+        self.episodes = 0
+
+    @property
+    def beta(self) -> float:
+        """β of the next episode."""
+        return max(self.config.floor, self.config.initial * self.config.decay**self.episodes)
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """See `BetaController`."""
+        self.episodes += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `BetaController`."""
+        return {"episodes": self.episodes}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `BetaController`."""
+        self.episodes = state["episodes"]

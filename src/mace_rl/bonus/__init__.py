@@ -1,0 +1,1 @@
+"""The curiosity bonus: novelty × what the episodic memory says of similar states."""

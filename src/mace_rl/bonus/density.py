@@ -1,0 +1,119 @@
+"""Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs.
+
+`MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same in
+compiled code; `DensityEstimator` makes a density of either's outputs.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numba import njit
+from torch.nn.functional import linear
+
+from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, Trace, mlp
+
+SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
+
+
+class MaskedAutoencoder(torch.nn.Module):
+    """μ_i and log σ_i, each a function of the inputs before the i-th: [N, size] → [N, 2 size].
+
+    One hidden layer with tanh. Masked weights start at 0 and their gradient is 0, so they stay
+    there.
+    """
+
+    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
+        super().__init__()
+        self.hidden, _, self.output = mlp([size, hidden_units, 2 * size], 0.1, generator)
+        # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
+        degrees = torch.arange(hidden_units) % max(size - 1, 1) + 1
+        coordinates = torch.arange(1, size + 1)
+        inward = degrees[:, None] >= coordinates
+        outward = (coordinates[:, None] > degrees).repeat(2, 1)
+        self.masks = inward.float(), outward.float()
+        with torch.no_grad():
+            for layer, mask in zip((self.hidden, self.output), self.masks, strict=True):
+                layer.weight *= mask
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """μ, then log σ, not bounded yet."""
+        inward, outward = self.masks
+        hidden = torch.tanh(linear(x, self.hidden.weight * inward, self.hidden.bias))
+        return linear(hidden, self.output.weight * outward, self.output.bias)
+
+
+class CompiledAutoencoder(CompiledMLP):
+    """`MaskedAutoencoder` in compiled code."""
+
+    def __init__(self, module: MaskedAutoencoder) -> None:
+        super().__init__(torch.nn.Sequential(module.hidden, torch.nn.Tanh(), module.output))
+        self.mask = np.ones_like(self.parameters)
+        for (weights, _), mask in zip(self.layers(self.mask), module.masks, strict=True):
+            weights[:] = mask.numpy().T
+
+    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
+        """See `Network`."""
+        return super().backward(trace, grad_outputs) * self.mask
+
+
+class DensityEstimator:
+    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)).
+
+    Being autoregressive it is normalised: p integrates to 1 whatever the weights are.
+    """
+
+    def __init__(
+        self, size: int, hidden_units: int, engine: str, generator: np.random.Generator
+    ) -> None:
+        module = MaskedAutoencoder(size, hidden_units, generator)
+        self.network: Network = (
+            CompiledAutoencoder(module) if engine == "compiled" else TorchNetwork(module)
+        )
+
+    def log_prob(self, x: np.ndarray) -> np.ndarray:
+        """Log-density of each row of x, [N, size] → [N]."""
+        outputs = self.network.forward(x).outputs
+        return gaussian_log_probs(x, outputs, self._inverse_std(outputs))
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """∇ of the mean log-density of the rows of x, [N, size], with respect to the parameters."""
+        trace = self.network.forward(x)
+        grad_outputs = gaussian_grad(x, trace.outputs, self._inverse_std(trace.outputs))
+        return self.network.backward(trace, grad_outputs)
+
+    def _inverse_std(self, outputs: np.ndarray) -> np.ndarray:
+        """1 / σ, [N, size], from the network's outputs, [N, 2 size]: μ, then log σ unbounded."""
+        log_std = outputs[:, outputs.shape[1] // 2 :]
+        return np.exp(-np.maximum(log_std, np.float32(SMALLEST_LOG_STD)))
+
+
+@njit(cache=True, error_model="numpy")
+def gaussian_log_probs(x, outputs, inverse_std):
+    """Σ_i log N(x_i; μ_i, σ_i) of each row, [N]; arguments as in `gaussian_grad`."""
+    count, size = x.shape
+    result = np.full(count, -0.5 * math.log(2 * math.pi) * size, x.dtype)
+    for n in range(count):
+        for i in range(size):
+            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
+            log_std = max(outputs[n, size + i], SMALLEST_LOG_STD)
+            result[n] -= 0.5 * deviation * deviation + log_std
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def gaussian_grad(x, outputs, inverse_std):
+    """Gradient of the mean over the rows of Σ_i log N(x_i; μ_i, σ_i) at the outputs, [N, 2 size].
+
+    x: [N, size]; outputs: [N, 2 size], μ and log σ, which has no gradient below its lower bound;
+    inverse_std: [N, size], 1 / σ.
+    """
+    count, size = x.shape
+    grad = np.empty_like(outputs)
+    for n in range(count):
+        for i in range(size):
+            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
+            grad[n, i] = deviation * inverse_std[n, i] / count
+            free = outputs[n, size + i] > SMALLEST_LOG_STD
+            grad[n, size + i] = (deviation * deviation - 1) / count if free else 0.0
+    return grad

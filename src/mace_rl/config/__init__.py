@@ -1,0 +1,1 @@
+"""Settings: every class of the configuration, checked once and light to import."""

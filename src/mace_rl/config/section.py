@@ -1,0 +1,109 @@
+"""What every section of the configuration shares: strictness, and one line for a mistake."""
+
+import difflib
+import re
+import types
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used; the message names key, value and what would be right."""
+
+
+class Section(BaseModel):
+    """Base of every configuration section: unknown keys, wrong types, NaN and Inf are errors."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=()
+    )
+
+
+def _reference(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", text):
+        raise ValueError("it should name Python code, as package.module:Name")
+    return text
+
+
+# Code of the user's own, "package.module:Name"; config/plugins.py says where it is looked for.
+Reference = Annotated[str, AfterValidator(_reference)]
+
+
+def check(model: type[Model], values: Any, origin: str) -> Model:
+    """Build `model` from `values`, or raise a one-line `ConfigError` for the first mistake.
+
+    `origin` says where the values come from (a file name) and starts the message.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{origin}: {explain(error, model)}") from None
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first problem of a pydantic `error` on one line: key, value, what would be right."""
+    problem = error.errors(include_url=False)[0]
+    key, known = _place(model, problem["loc"])
+    key = key or "the configuration"
+    match problem["type"]:
+        case "extra_forbidden":
+            nearest = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0)
+            return (
+                f"unknown key {key!r} (value {short(problem['input'])}); "
+                f"the nearest known key is {nearest[0]!r}"
+            )
+        case "missing":
+            return f"the key {key!r} is missing"
+        case _:
+            reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+            reason = " ".join(reason.replace(" after validation, not 0", "").split())
+            return f"{key} is {short(problem['input'])}, but {reason}{_advice(problem['input'])}"
+
+
+def short(value: Any) -> str:
+    """`repr` of a value, cut to 60 characters."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _advice(value: Any) -> str:
+    """For numbers that YAML takes for text."""
+    if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", value):
+        number = int(value) if re.fullmatch(r"[-+]?\d+", value) else float(value)
+        return f" (YAML takes it for text: write {number!r}, without quotes)"
+    return ""
+
+
+def _place(model: type[BaseModel], location: tuple[Any, ...]) -> tuple[str, list[str]]:
+    """`location` as the file has it, and the known keys of the section its last element is in."""
+    names: list[str] = []
+    beside = candidates = [model]
+    for part in location:
+        tagged = [candidate for candidate in candidates if part in _kinds(candidate)]
+        if tagged:  # the member of a union that its `kind` chose, which the file does not name
+            candidates = tagged
+            continue
+        names.append(str(part))
+        beside = candidates
+        fields = [c.model_fields[part] for c in candidates if part in c.model_fields]
+        if fields:
+            candidates = [one for field in fields for one in _sections(field.annotation)]
+    return ".".join(names), list(dict.fromkeys(key for one in beside for key in one.model_fields))
+
+
+def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
+    """The values of the literal `kind` of one member of a union."""
+    field = model.model_fields.get("kind")
+    literal = field is not None and get_origin(field.annotation) is Literal
+    return get_args(field.annotation) if field is not None and literal else ()
+
+
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """The settings classes in a type: itself, or the members of a union."""
+    if get_origin(annotation) in (Union, types.UnionType, Annotated):
+        return [one for argument in get_args(annotation) for one in _sections(argument)]
+    is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    return [annotation] if is_section else []

@@ -1,0 +1,257 @@
+"""The study: which runs there are, with which hyperparameters, and how they are evaluated.
+
+`config.yaml`, with the files read over it, is checked here as a whole before any job starts. This
+module is imported whenever the workflow is planned, so it stays clear of torch and numba.
+"""
+
+import difflib
+import importlib.util
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
+from matplotlib.colors import is_color_like
+from pydantic import AfterValidator, Field, ValidationError
+
+from mace_rl.config.plugins import import_module, load, source_file
+from mace_rl.config.reading import Settings, merge, read_yaml
+from mace_rl.config.results import FigureConfig, MetricsConfig
+from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
+from mace_rl.config.section import ConfigError, Section, check, explain, short
+
+# Environments and variants name folders and appear in Snakemake's patterns; an environment may
+# name its module too, as in Gymnasium: package.module:Id.
+SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+
+LOOK = ("label", "colour")  # of a variant in tables and figures, not a setting of its runs
+
+
+def _colour(name: str) -> str:
+    if not is_color_like(name):
+        raise ValueError("it should be a colour of Matplotlib's, such as tab:blue or '#1f77b4'")
+    return name
+
+
+def _folder(path: str) -> str:
+    if not path.strip() or re.search(r"[{}\n\r\0*?\[\]]", path):
+        raise ValueError("it should be the path of a folder, without {}*?[]")
+    for part in (Path(path), *Path(path).parents):
+        if part.exists() and not part.is_dir():
+            raise ValueError(f"it should be a folder, and {part} is a file")
+    return path
+
+
+def _once(values: list[Any]) -> list[Any]:
+    repeated = [value for value, count in Counter(values).items() if count > 1]
+    if repeated:
+        raise ValueError(f"{repeated[0]!r} should be there once")
+    return values
+
+
+def _name(name: str) -> str:
+    if not re.fullmatch(SAFE_NAME, name):
+        raise ValueError(
+            "a name here becomes a folder: it should consist of letters, digits, '.', '_' and '-', "
+            "and begin with a letter or digit"
+        )
+    return name
+
+
+class Variant(Section):
+    """One variant: what sets its β, what else differs, and how it is shown.
+
+    Whatever else stands here goes over `training` and the environment's settings.
+    """
+
+    model_config = Section.model_config | {"extra": "allow"}
+
+    label: str | None = None  # in tables and figures; None: its name
+    colour: Annotated[str, AfterValidator(_colour)] | None = None  # None: Matplotlib's next
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of its runs."""
+        return dict(self.model_extra or {})
+
+
+class Study(Section):
+    """All runs of a study, every environment × variant × seed, and how they are evaluated."""
+
+    results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
+    environments: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
+    variants: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
+    seeds: Annotated[
+        list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_once)
+    ]
+    training: Settings  # hyperparameters of every run ...
+    environment_settings: dict[str, Settings]  # ... changed for an environment ...
+    variant_settings: dict[Annotated[str, AfterValidator(_name)], Variant]  # ... and for a variant
+    metrics: MetricsConfig
+    figure: FigureConfig
+
+    @cached_property
+    def _combinations(self) -> dict[tuple[str, str], RunConfig]:
+        """The checked settings of every environment and variant, selected or not, for seed 0."""
+        environments = dict.fromkeys([*self.environments, *self.environment_settings])
+        return {
+            (environment, variant): _resolve(self, environment, variant)
+            for environment in environments
+            for variant in self.variant_settings
+        }
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The names of the study's variants in tables and figures."""
+        return {name: self.variant_settings[name].label or name for name in self.variants}
+
+    @property
+    def colours(self) -> dict[str, str]:
+        """The colours of the study's variants."""
+        places = {name: f"C{place}" for place, name in enumerate(self.variant_settings)}
+        return {name: self.variant_settings[name].colour or places[name] for name in self.variants}
+
+    def run_config(self, environment: str, variant: str, seed: int) -> RunConfig:
+        """The settings of one run: `training`, then the environment's, then the variant's.
+
+        The environment and the variant need settings, not a place in the study's lists. Raises
+        `ConfigError` for a seed out of range and, if they are new to the study, for what
+        `load_study` would refuse in an environment or a variant.
+        """
+        if (environment, variant) not in self._combinations:
+            _check_known(variant, self.variant_settings, "variant", "variant_settings")
+            template = _resolve(self, environment, variant)
+            _check_environment(template, "environment")
+        else:
+            template = self._combinations[environment, variant]
+        if not 0 <= seed < 2**32:
+            raise ConfigError(f"seed is {seed}, but should be from 0 to 4294967295")
+        return template.model_copy(update={"seed": seed})
+
+
+def load_study(config: Any, origin: str) -> Study:
+    """Check a configuration as a whole, every run's settings included.
+
+    `origin` (file names) starts the message of the `ConfigError`, one line with the key, the value
+    and what would be right, that the first mistake raises.
+    """
+    if not isinstance(config, Mapping):
+        raise ConfigError(f"{origin}: it is {short(config)}, but should be keys with values")
+    study = check(Study, {str(key): value for key, value in config.items()}, origin)
+    try:
+        for variant in study.variants:
+            _check_known(variant, study.variant_settings, "variants", "variant_settings")
+        known = dict.fromkeys(study.environments, "environments")
+        known |= dict.fromkeys(study.environment_settings, "environment_settings")
+        for environment, key in known.items():
+            _check_name(environment, key)
+            for variant in study.variant_settings:  # every run's settings are checked here
+                _check_environment(study._combinations[environment, variant], key)
+        for environment in study.environments:
+            study.metrics.random_return_in(environment)  # there has to be one
+        for reference in study.metrics.custom:
+            load(reference, "metrics.custom")
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from None
+    return study
+
+
+def read_study(paths: Sequence[Path]) -> Study:
+    """The study of one YAML file and others read over it: mappings merge, lists are replaced.
+
+    Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a file
+    gives twice, and everything that `load_study` refuses.
+    """
+    config: Settings = {}
+    for path in paths:
+        config = merge(config, read_yaml(path))
+    return load_study(config, " + ".join(str(path) for path in paths))
+
+
+def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
+    """The checked settings of one environment and variant, for seed 0."""
+    layers = {
+        "training": study.training,
+        f"environment_settings.{environment}": study.environment_settings.get(environment, {}),
+        f"variant_settings.{variant}": study.variant_settings[variant].settings,
+    }
+    settings: Settings = {}
+    for name, layer in layers.items():
+        for key in IDENTITY:
+            if key in layer:
+                raise ConfigError(
+                    f"{name}.{key} is {short(layer[key])}, but the lists environments, variants "
+                    "and seeds say which runs there are"
+                )
+        settings = merge(settings, layer, whole={"beta"})
+    settings |= {"environment": environment, "variant": variant, "seed": 0}
+    try:
+        config = RunConfig.model_validate(settings)
+    except ValidationError as error:
+        location = error.errors(include_url=False)[0]["loc"]
+        name = max(reversed(layers), key=lambda name: _depth(layers[name], location))
+        raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
+    for key, reference in config.references().items():
+        source_file(reference, f"in the settings of {environment} and {variant}, {key}")
+    for section in unused_sections(config.beta.kind):
+        if section in study.variant_settings[variant].settings:
+            raise ConfigError(
+                f"variant_settings.{variant} has the section {section!r}, which a variant with "
+                f"beta.kind {config.beta.kind!r} does not use"
+            )
+    return config
+
+
+def _depth(layer: Any, location: Iterable[Any]) -> int:
+    """How many keys on the way to `location` the layer has itself."""
+    depth = 0
+    for key in location:
+        if isinstance(layer, Mapping) and key in layer:
+            layer, depth = layer[key], depth + 1
+    return depth
+
+
+def _check_name(environment: str, key: str) -> None:
+    if not re.fullmatch(rf"({SAFE_NAME}:)?{SAFE_NAME}", environment):
+        raise ConfigError(
+            f"{key} has {environment!r}, but a name here becomes a folder: it should consist of "
+            "letters, digits, '.', '_' and '-', and begin with a letter or digit; a module and "
+            "':' may stand before it"
+        )
+
+
+def _check_environment(config: RunConfig, key: str) -> None:
+    """Refuse an environment that cannot be made with these settings, without making it."""
+    name = config.environment
+    _check_name(name, key)
+    if ":" in name:
+        import_module(name, key)  # which registers it
+    registered = name.rpartition(":")[2]
+    if registered not in gymnasium.registry:
+        _check_known(registered, list(gymnasium.registry), key, "Gymnasium's registry")
+    spec = gymnasium.registry[registered]
+    if (config.max_episode_steps or spec.max_episode_steps) is None:
+        raise ConfigError(
+            f"{key} has {name!r}, which has no time limit of its own, so that its episodes need "
+            f"not end: environment_settings.{name}.max_episode_steps should set one"
+        )
+    if isinstance(spec.entry_point, str):
+        try:  # imports the packages around the environment's module, not that module
+            importlib.util.find_spec(spec.entry_point.partition(":")[0])
+        except (ImportError, gymnasium.error.Error) as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"{key} has {name!r}, but the package it needs should be installed: {reason}"
+            ) from None
+
+
+def _check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
+    known = list(known)
+    if name not in known:
+        nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)
+        hint = f"; the nearest there is {nearest[0]!r}" if nearest else ""
+        raise ConfigError(f"{key} has {name!r}, which is not in {where}{hint}")

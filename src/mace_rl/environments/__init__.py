@@ -1,0 +1,1 @@
+"""Environments, and acting in them."""

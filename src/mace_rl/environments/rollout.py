@@ -1,0 +1,132 @@
+"""Acting: one episode with the current policy.
+
+`roll_out` steps any environment; CartPole-v1 and Acrobot-v1 run in one compiled loop instead,
+which gives the same episode to the bit. Callers cannot tell which one ran.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
+
+from mace_rl.agent.policy import ActingPolicy, CompiledActing
+from mace_rl.environments import classic_control
+from mace_rl.environments.environment import Environment
+from mace_rl.finite import require_finite
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of T steps as it was played."""
+
+    observations: np.ndarray  # float32 [T + 1, observation], the last one after the last step
+    actions: np.ndarray  # int64 [T] from 0, or float32 [T, actions] before clipping
+    log_probs: np.ndarray  # float32 [T], of the actions when they were taken
+    rewards: np.ndarray  # float64 [T], extrinsic
+    terminated: bool  # False: cut off by the time limit
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def draw_noise(environment: Environment, generator: np.random.Generator) -> np.ndarray:
+    """The random numbers that turn policy outputs into actions, for a whole episode.
+
+    Drawn before the episode and always up to the time limit, so that both rollouts use up the
+    stream alike. Uniform, [max_steps], for Discrete actions; else standard normal,
+    [max_steps, actions].
+    """
+    if isinstance(environment.action_space, gymnasium.spaces.Discrete):
+        return generator.random(environment.max_steps)
+    return generator.standard_normal((environment.max_steps, environment.action_space.shape[0]))
+
+
+def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
+    """Play one episode by stepping the environment; see `Episode`."""
+    env, space = environment.env, environment.action_space
+    discrete = isinstance(space, gymnasium.spaces.Discrete)
+    observations = np.empty((len(noise) + 1, environment.observation_size), np.float32)
+    actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
+    log_probs = np.empty(len(noise), np.float32)
+    rewards = np.empty(len(noise))
+    observation, _ = env.reset()
+    vector = observations[0]
+    vector[:] = environment.encode(observation)
+    require_finite("the observation", vector, " after the reset")
+    terminated = truncated = False
+    t = 0
+    while not (terminated or truncated):
+        action, log_prob = policy.act(vector, noise[t])
+        env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
+        observation, reward, terminated, truncated, _ = env.step(env_action)
+        actions[t], log_probs[t], rewards[t] = action, log_prob, reward
+        t += 1
+        vector = observations[t]
+        vector[:] = environment.encode(observation)
+        if not (math.isfinite(reward) and math.isfinite(vector.sum())):
+            require_finite("the reward", reward, f" after step {t}")
+            require_finite("the observation", vector, f" after step {t}")
+    # Copies: an episode that ended early should not hold the memory of a whole one.
+    return Episode(
+        observations=observations[: t + 1].copy(),
+        actions=actions[:t].copy(),
+        log_probs=log_probs[:t].copy(),
+        rewards=rewards[:t].copy(),
+        terminated=bool(terminated),
+    )
+
+
+def roll_out_compiled(
+    environment: Environment, policy: CompiledActing, noise: np.ndarray
+) -> Episode:
+    """Play one episode of CartPole-v1 or Acrobot-v1 in compiled code, equal to `roll_out`."""
+    observation, _ = environment.env.reset()
+    inner = environment.env.unwrapped
+    cartpole = isinstance(inner, CartPoleEnv)
+    which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
+    return Episode(
+        *classic_control.episode(
+            which, np.array(inner.state, np.float64), observation, *policy[:5], noise
+        )
+    )
+
+
+def rollout_for(
+    environment: Environment, policy: ActingPolicy
+) -> Callable[[Environment, ActingPolicy, np.ndarray], Episode]:
+    """The fastest rollout that is exact for this environment and this kind of policy.
+
+    The compiled one has to take the same steps as the environment, which is tried here: other
+    parameters, another version or a C library with another sine all end in the ordinary rollout.
+    """
+    compiled_class = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}.get(environment.name)
+    exact = type(environment.env.unwrapped) is compiled_class
+    if not (exact and isinstance(policy, CompiledActing)):
+        return roll_out
+    return roll_out_compiled if takes_compiled_steps(environment.env.unwrapped) else roll_out
+
+
+def takes_compiled_steps(inner: CartPoleEnv | AcrobotEnv) -> bool:
+    """Whether a few hundred steps, anywhere in the state space, equal the compiled ones.
+
+    Every episode starts with a reset, so the states set here leave no trace.
+    """
+    states = np.random.default_rng(0)
+    generator = inner.np_random.bit_generator.state
+    same = True
+    for _ in range(300):
+        state = states.standard_normal(4) * states.choice([0.01, 0.1, 1.0, 10.0], 4)
+        action = int(states.integers(inner.action_space.n))
+        inner.state, inner.steps_beyond_terminated = state.copy(), None
+        _, reward, terminated, _, _ = inner.step(action)
+        if isinstance(inner, CartPoleEnv):
+            expected = classic_control.step_cartpole(state, action)
+        else:
+            expected = classic_control.step_acrobot(state, action, 2.0)
+        same = (reward, terminated) == expected and np.array_equal(inner.state, state) and same
+    same = same and inner.np_random.bit_generator.state == generator  # torque noise draws
+    inner.np_random.bit_generator.state = generator
+    return same

@@ -1,0 +1,347 @@
+"""What is measured on one run: how well it ends, and how soon it gets there.
+
+`METRICS` is the table of it, and columns, tables and comparisons follow it. A metric is a pure
+function of a `LearningCurve`; further ones, outside of this package, are added by the configuration
+(`metrics.custom`). An `Episode` metric that a run never attains is reported as E and flagged as
+censored, never dropped; E is then a lower bound.
+
+The paper's definitions ("Detail of Evaluation Metrics") are `final_return`, `sample_efficiency`
+and `convergence_steps`; Table 1 uses these. The others show what another reading changes.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product
+from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from mace_rl.config.plugins import load
+from mace_rl.config.results import MetricsConfig
+from mace_rl.config.section import ConfigError
+from mace_rl.results.records import RecordError, RunKey, read_table
+
+if TYPE_CHECKING:  # pandas is imported where a frame is built: planning the workflow does without
+    import pandas as pd
+
+PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
+PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
+PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
+
+COLUMN_TYPES = {"episodes": int, "return": float}  # of metrics.csv, by a metric's unit
+
+
+class Episode(NamedTuple):
+    """The episode (from 1) at which something is attained; E and censored if it never is."""
+
+    number: int
+    censored: bool
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """What a metric sees of one run."""
+
+    returns: np.ndarray  # float64 [E], the extrinsic return of each training episode
+    final: float  # `final_return` of these
+    random_mean: float  # mean return of uniformly random actions in this environment
+    settings: MetricsConfig
+
+    def first(self, reached: np.ndarray, episode: int = 1) -> Episode:
+        """The first true entry of `reached` [n], whose entry 0 belongs to episode `episode`."""
+        if not reached.any():
+            return Episode(len(self.returns), True)
+        return Episode(episode + int(np.argmax(reached)), False)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One thing measured on each run."""
+
+    name: str  # of its column in metrics.csv
+    label: str  # in tables
+    unit: Literal["episodes", "return"]  # of episodes fewer are better, of return more
+    function: Callable[[LearningCurve], Episode | float]  # an Episode if the unit is episodes
+
+    @property
+    def flag(self) -> str:
+        """The column that tells which episodes are censored."""
+        return f"{self.name}_censored"
+
+
+def final_return(returns: np.ndarray, fraction: float) -> float:
+    """Mean return of the last `fraction` of the episodes (paper: the last 10 %).
+
+    Where that is no whole number of episodes it is rounded up: 15 episodes end with the last 2.
+    """
+    last = math.ceil(Fraction(repr(fraction)) * len(returns))  # 0.07 of 100 is 7, not 7.000…001
+    return float(np.mean(returns[-last:]))
+
+
+def moving_average(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of each `window` consecutive values, [E - window + 1]; empty if E < window.
+
+    Entry i is the average after episode `window` + i.
+    """
+    return _moving_sum(values, window) / window
+
+
+def slope(returns: np.ndarray, window: int) -> np.ndarray:
+    """Slope of the moving average in return per episode, [E - 2 · window + 1] or empty.
+
+    Entry i belongs to episode 2 · `window` + i and compares the last `window` episodes with the
+    `window` before them. (From one episode to the next, a moving average changes by the difference
+    of two single episodes: that slope is noise, and 0 wherever two returns happen to be equal.)
+    """
+    total = _moving_sum(returns, window)
+    return (total[window:] - total[:-window]) / window**2
+
+
+def sample_efficiency(curve: LearningCurve) -> Episode:
+    """The first episode with a return ≥ threshold · final (paper, literally).
+
+    A single lucky episode is enough. Where returns are negative the bar lies *above* the final
+    return (75 % of -85 is -63.75) and may never be reached.
+    """
+    return curve.first(curve.returns >= curve.settings.threshold * curve.final)
+
+
+def convergence_steps(curve: LearningCurve) -> Episode:
+    """The point where the slope of the moving average becomes minimal (paper).
+
+    Our reading: while the agent learns the average rises; training "yields diminishing returns"
+    where it stops to. So: the first episode after the steepest rise at which the slope is no longer
+    positive, its magnitude having come down to its minimum, 0. On a curve that rises and stays,
+    this is the first episode of smallest absolute slope after the rise. Searching the whole curve
+    for the smallest absolute slope instead finds the flat start of a run that has yet to learn, or
+    chance on the final plateau: `convergence_steps_flattest`.
+
+    Censored: the average never rises, is still rising at the end, or E < 2 windows.
+    """
+    window = curve.settings.moving_average
+    slopes = slope(curve.returns, window)
+    if not (slopes > 0).any():
+        return Episode(len(curve.returns), True)
+    steepest = int(np.argmax(slopes))  # the first of equals
+    return curve.first(slopes[steepest:] <= 0, 2 * window + steepest)
+
+
+def convergence_steps_flattest(curve: LearningCurve) -> Episode:
+    """The first episode at which the absolute slope is smallest in all of training.
+
+    The most literal reading of the paper's sentence. Censored only if E < 2 windows.
+    """
+    window = curve.settings.moving_average
+    magnitude = np.abs(slope(curve.returns, window))
+    return curve.first(magnitude == magnitude.min(initial=np.inf), 2 * window)
+
+
+def convergence_steps_public_code(curve: LearningCurve) -> Episode:
+    """The rule of the authors' public code, whatever the window configured here.
+
+    The first 50-episode window past 30 % of training after which the moving average changes by less
+    than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
+    first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learnt.
+    """
+    floor = int(PUBLIC_CODE_FLOOR * (len(curve.returns) - PUBLIC_CODE_WINDOW + 1))
+    flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[floor:]) < PUBLIC_CODE_SLOPE
+    return curve.first(flat, floor + 1)
+
+
+def sample_efficiency_range(curve: LearningCurve) -> Episode:
+    """The first episode whose moving average has come threshold of the way from random to final.
+
+    The bar is random + threshold · (final - random): it means the same for negative returns, and
+    one lucky episode does not reach it. Censored: never reached, or the run ends no better than
+    random.
+    """
+    settings, gain = curve.settings, curve.final - curve.random_mean
+    average = moving_average(curve.returns, settings.moving_average)
+    reached = average >= curve.random_mean + settings.threshold * gain
+    return curve.first(reached & (gain > 0), settings.moving_average)
+
+
+def convergence_steps_range(curve: LearningCurve) -> Episode:
+    """The first episode from which on the moving average stays near the final return.
+
+    Near is within band · (final - random). Censored: the average ends outside that band, or the
+    run ends no better than random.
+    """
+    settings, gain = curve.settings, curve.final - curve.random_mean
+    average = moving_average(curve.returns, settings.moving_average)
+    near = np.abs(average - curve.final) <= settings.convergence_band * gain
+    settled = np.logical_and.accumulate(near[::-1])[::-1]
+    return curve.first(settled & (gain > 0), settings.moving_average)
+
+
+METRICS = (
+    Metric("final_return", "Final return", "return", lambda curve: curve.final),
+    Metric("sample_efficiency", "Sample efficiency", "episodes", sample_efficiency),
+    Metric("convergence_steps", "Convergence", "episodes", convergence_steps),
+    Metric(  # under the learning curve, per episode
+        "area_under_curve", "Mean return of training", "return", lambda curve: curve.returns.mean()
+    ),
+    Metric(
+        "sample_efficiency_range", "Sample efficiency (range)", "episodes", sample_efficiency_range
+    ),
+    Metric("convergence_steps_range", "Convergence (range)", "episodes", convergence_steps_range),
+    Metric(
+        "convergence_steps_flattest",
+        "Convergence (flattest)",
+        "episodes",
+        convergence_steps_flattest,
+    ),
+    Metric(
+        "convergence_steps_public_code",
+        "Convergence (public code)",
+        "episodes",
+        convergence_steps_public_code,
+    ),
+)
+
+
+def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
+    """`METRICS` and, after them, those of `metrics.custom`; `ConfigError` for what is no metric."""
+    metrics = list(METRICS)
+    for reference in settings.custom:
+        metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
+        if not isinstance(metric, Metric):
+            problem = f"is no mace_rl.results.metrics.Metric but of type {type(metric).__name__}"
+        elif not metric.name.isidentifier():
+            problem = f"has the name {metric.name!r}, but a column's name should be a word"
+        elif {metric.name, metric.flag} & columns.keys():
+            problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
+        elif metric.unit not in COLUMN_TYPES:
+            problem = f"has the unit {metric.unit!r}, but should have {' or '.join(COLUMN_TYPES)}"
+        else:
+            metrics.append(metric)
+            continue
+        raise ConfigError(f"metrics.custom has {reference!r}, which {problem}")
+    return tuple(metrics)
+
+
+def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
+    """The columns of metrics.csv, one row per run, with these metrics."""
+    run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}
+    values = {metric.name: COLUMN_TYPES[metric.unit] for metric in metrics}
+    return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
+
+
+def metrics_of_run(
+    frame: "pd.DataFrame", run: RunKey, settings: MetricsConfig
+) -> dict[str, str | int | float]:
+    """The row of metrics.csv of one run, from its records (`read_episodes`)."""
+    environment, variant, seed = run
+    returns = frame["extrinsic_return"].to_numpy()
+    final = final_return(returns, settings.final_fraction)
+    curve = LearningCurve(returns, final, settings.random_return_in(environment), settings)
+    row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(returns)}
+    row["env_steps"] = int(frame["env_steps"].iloc[-1])
+    metrics = all_metrics(settings)
+    for metric in metrics:
+        value = metric.function(curve)
+        if metric.unit == "return" and isinstance(value, Real) and math.isfinite(value):
+            row[metric.name] = float(value)
+        elif metric.unit == "episodes" and isinstance(value, Episode):
+            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
+        else:
+            kind = "an Episode" if metric.unit == "episodes" else "a finite number"
+            raise ConfigError(f"{metric.name} of {_name(run)} is {value!r}, but should be {kind}")
+    return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def metrics_table(
+    runs: Mapping[RunKey, "pd.DataFrame"],
+    environments: Sequence[str],
+    variants: Sequence[str],
+    seeds: Sequence[int],
+    settings: MetricsConfig,
+) -> "pd.DataFrame":
+    """One row of `metrics_columns` per run, in the configured order.
+
+    Raises `RecordError` unless `runs` holds exactly every environment, variant and seed, and
+    `ConfigError` for metrics that cannot be.
+    """
+    import pandas as pd
+
+    wanted = list(product(environments, variants, seeds))
+    _check_runs("the records", runs, wanted)
+    table = pd.DataFrame([metrics_of_run(runs[run], run, settings) for run in wanted])
+    _check_attained("the table of metrics", table, all_metrics(settings))
+    _check_budgets("the records", table)
+    return table
+
+
+def read_metrics(
+    path: str | Path,
+    environments: Sequence[str],
+    variants: Sequence[str],
+    seeds: Sequence[int],
+    settings: MetricsConfig,
+) -> "pd.DataFrame":
+    """Read metrics.csv; `RecordError` unless it is `metrics_table` of exactly these runs."""
+    metrics = all_metrics(settings)
+    table = read_table(path, metrics_columns(metrics))
+    found = list(zip(table["env"], table["variant"], table["seed"].tolist(), strict=True))
+    wanted = list(product(environments, variants, seeds))
+    _check_runs(str(path), found, wanted)
+    for line, (run, right) in enumerate(zip(found, wanted, strict=True), start=2):
+        if run != right:
+            raise RecordError(
+                f"{path}: line {line}: {_name(run)} stands where {_name(right)} belongs"
+            )
+    _check_attained(str(path), table, metrics)
+    _check_budgets(str(path), table)
+    return table
+
+
+def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:
+    """Sum of each `window` consecutive values: exact for whole numbers, so that ties are ties."""
+    if len(values) < window:
+        return np.empty(0)
+    return np.lib.stride_tricks.sliding_window_view(values, window).sum(axis=-1)
+
+
+def _check_runs(origin: str, found: Iterable[RunKey], wanted: Sequence[RunKey]) -> None:
+    """Refuse a set of runs that is not exactly the configured one."""
+    counts = Counter(iter(found))
+    for run in wanted:
+        if counts[run] != 1:
+            problem = "stands more than once in" if counts[run] else "is missing from"
+            raise RecordError(f"{_name(run)} {problem} {origin}")
+    for run in counts.keys() - set(wanted):
+        raise RecordError(f"{_name(run)} in {origin} is not in the configuration")
+
+
+def _check_budgets(origin: str, table: "pd.DataFrame") -> None:
+    """Refuse seeds of different lengths, which must not be averaged."""
+    for (environment, variant), group in table.groupby(["env", "variant"], sort=False):
+        if group["episodes"].nunique() != 1:
+            counts = sorted(set(group["episodes"]))
+            raise RecordError(
+                f"{origin}: the seeds of {environment}, {variant} have different numbers of"
+                f" episodes: {counts}"
+            )
+
+
+def _check_attained(origin: str, table: "pd.DataFrame", metrics: Sequence[Metric]) -> None:
+    """Refuse episodes outside of training, and flags that contradict them."""
+    for metric in (metric for metric in metrics if metric.unit == "episodes"):
+        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
+        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
+        if not right.all():
+            row = int(np.argmin(right))
+            raise RecordError(
+                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
+                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
+            )
+
+
+def _name(run: RunKey) -> str:
+    environment, variant, seed = run
+    return f"the run {environment}, {variant}, seed {seed}"

@@ -1,0 +1,193 @@
+"""`episodes.csv`: one row per training episode, and the only thing the results are computed from.
+
+A file that is not exactly what training writes is refused with one line that names the file and
+the line, because a damaged record would otherwise become a plausible number in Table 1.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from mace_rl.files import write_atomically
+
+if TYPE_CHECKING:  # pandas is imported where a frame is built: training only writes
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """One episode of training, a row of `episodes.csv`."""
+
+    episode: int  # 1, 2, …
+    env_steps: int  # environment steps since the start of training, this episode included
+    length: int  # environment steps of this episode
+    extrinsic_return: float  # undiscounted sum of the environment's rewards
+    intrinsic_return: float  # undiscounted sum of the curiosity bonus, not weighted by β
+    beta: float  # β of this episode
+    terminated: int  # 1: the environment ended the episode, 0: its time limit did
+
+
+@dataclass(frozen=True)
+class UpdateRecord:
+    """One update, a row of `diagnostics.csv`; NaN where a variant has no such number."""
+
+    update: int  # 1, 2, …
+    episode: int  # the last one of the update's rollout
+    env_steps: int  # environment steps since the start of training
+    approximate_kl: float  # mean of r - 1 - log r over the update's last epoch
+    clip_fraction: float  # share of the ratios r outside the clipping bounds, last epoch
+    entropy: float  # of the policy, mean over the last epoch, nats
+    explained_variance_extrinsic: float  # 1 - Var(return - V) / Var(return), before the update
+    explained_variance_intrinsic: float
+    gradient_norm_actor: float  # of the last minibatch, before clipping
+    gradient_norm_extrinsic: float  # of that reward's critic
+    gradient_norm_intrinsic: float
+    beta: float  # mean over the rollout's episodes
+    bonus_share: float  # Var(β A_I) / (Var(A_E) + Var(β A_I))
+    novelty: float  # mean over the rollout's steps, like the next two
+    relevance: float
+    similarity: float  # of a state to what the memory holds
+    beta_credit: float  # how the extrinsic return rose with the βs that could be judged
+
+
+RunKey = tuple[str, str, int]  # environment, variant, seed
+
+Row = TypeVar("Row", EpisodeRecord, UpdateRecord)
+
+
+def as_columns(kind: type[Row], rows: Sequence[Row]) -> dict[str, np.ndarray]:
+    """The values of the rows by column, int64 or float64 [rows]."""
+    types = {int: np.int64, float: np.float64}
+    return {
+        field.name: np.array([getattr(row, field.name) for row in rows], types[field.type])
+        for field in fields(kind)
+    }
+
+
+def as_rows(kind: type[Row], columns: Mapping[str, np.ndarray]) -> list[Row]:
+    """What `as_columns` made columns of."""
+    values = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [kind(**dict(zip(columns, row, strict=True))) for row in values]
+
+
+_BOUND = {int: 2**53, float: np.inf}  # of a number's size: an int is exact as a double
+
+
+class RecordError(ValueError):
+    """A result file that cannot be trusted; the message names the file and the line."""
+
+
+def write_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write the columns of `EpisodeRecord` (`as_columns`), atomically.
+
+    Doubles are written in the shortest form that reads back as the same double. Raises
+    `RecordError` for what no training could have produced, and `read_episodes` would refuse.
+    """
+    _check_episodes(path, columns)
+    _write(path, columns)
+
+
+def write_diagnostics(path: str | Path, rows: Sequence[UpdateRecord]) -> None:
+    """Write `diagnostics.csv`, atomically; NaN is an empty cell."""
+    _write(path, as_columns(UpdateRecord, rows))
+
+
+def _write(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    lines = (",".join("" if value != value else repr(value) for value in row) for row in rows)
+    write_atomically(path, "\n".join([",".join(columns), *lines]) + "\n")
+
+
+def read_episodes(path: str | Path, episodes: int) -> "pd.DataFrame":
+    """Read the records of a finished run of `episodes` training episodes.
+
+    Returns a frame with the columns of `EpisodeRecord` (int64 and float64) and one row per
+    episode. Raises `RecordError` for a file that `write_episodes` did not write in full.
+    """
+    frame = read_table(path, {field.name: field.type for field in fields(EpisodeRecord)})
+    _check_episodes(path, {name: frame[name].to_numpy() for name in frame})
+    if len(frame) != episodes:
+        raise RecordError(
+            f"{path}: line {len(frame) + 1} is the last, after {len(frame)} episodes;"
+            f" the run is configured to have {episodes}"
+        )
+    return frame
+
+
+def read_table(path: str | Path, columns: Mapping[str, type]) -> "pd.DataFrame":
+    """A CSV file with a header of exactly `columns`, each of them int, float or str, as a frame.
+
+    Raises `RecordError` for a file that is missing, cut off, or not what writing its rows would
+    give again, to the byte. (`pandas.read_csv` would make something of most of these.)
+    """
+    import pandas as pd
+
+    try:
+        *lines, rest = Path(path).read_bytes().split(b"\n")
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    if rest or not lines:
+        raise RecordError(f"{path}: line {len(lines) + 1}: the file ends within this line")
+    header = lines[0].decode(errors="replace").split(",")
+    for found, wanted in zip_longest(header, columns, fillvalue=""):
+        if found != wanted:
+            raise RecordError(
+                f"{path}: line 1: the column {found!r} stands where {wanted!r} should"
+            )
+    rows = []
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            cells = line.decode().split(",")
+            if len(cells) != len(columns):
+                raise ValueError(f"{len(cells)} cells instead of {len(columns)}")
+            rows.append(list(map(_parse, cells, columns.values(), columns)))
+        except ValueError as error:
+            raise RecordError(f"{path}: line {number}: {error}") from None
+    return pd.DataFrame(rows, columns=list(columns)).astype(dict(columns))
+
+
+def _parse(cell: str, kind: type, name: str) -> int | float | str:
+    """One cell as `kind`; ValueError with column and cell if it would not be written like this."""
+    try:
+        value = kind(cell)
+    except ValueError:
+        value = np.nan
+    if str(value) != cell or not (kind is str or abs(value) < _BOUND[kind]):
+        wanted = "an integer" if kind is int else "a finite number"
+        raise ValueError(f"{name} is {cell!r}, not {wanted}")
+    return value
+
+
+def _check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Refuse rows that no training could have produced; `columns` hold arrays [episodes]."""
+    rules = (  # column, whether each row is right [episodes], what would be right
+        (
+            "episode",
+            columns["episode"] == np.arange(len(columns["episode"])) + 1,
+            "the next number",
+        ),
+        ("length", columns["length"] >= 1, "at least 1"),
+        (
+            "env_steps",
+            columns["env_steps"] == np.cumsum(columns["length"]),
+            "the sum of the lengths so far",
+        ),
+        ("extrinsic_return", np.isfinite(columns["extrinsic_return"]), "finite"),
+        ("intrinsic_return", _within(columns["intrinsic_return"], 0, np.inf), "finite and >= 0"),
+        ("beta", _within(columns["beta"], 0, 1), "in [0, 1]"),
+        ("terminated", _within(columns["terminated"], 0, 1), "0 or 1"),
+    )
+    wrong = [(int(np.argmin(right)), name, wish) for name, right, wish in rules if not right.all()]
+    if wrong:
+        row, name, wish = min(wrong, key=lambda found: found[0])
+        value = columns[name][row].item()
+        raise RecordError(f"{path}: line {row + 2}: {name} is {value!r}, not {wish}")
+
+
+def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Whether each value [n] is finite and in [low, high]."""
+    return np.isfinite(values) & (values >= low) & (values <= high)

@@ -1,0 +1,365 @@
+"""The paper's Table 1 and Table 2 from our runs and our configuration, as data and as LaTeX.
+
+The LaTeX is a fragment for \\input; it needs the package booktabs and nothing else.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.config.run import CompiledNetwork, PPOConfig, TorchModule
+from mace_rl.results.metrics import Metric, all_metrics
+from mace_rl.results.statistics import interval_kind, mean_interval
+
+PAPER_METRICS = ("sample_efficiency", "convergence_steps")  # of Table 1
+
+# Paper, Table 1: (environment, variant) -> sample efficiency, convergence steps, in episodes.
+PAPER_TABLE1 = {
+    ("Acrobot-v1", "ppo"): (186, 617),
+    ("Acrobot-v1", "mace_fixed"): (201, 595),
+    ("Acrobot-v1", "mace_full"): (249, 586),
+    ("CartPole-v1", "ppo"): (140, 660),
+    ("CartPole-v1", "mace_fixed"): (120, 620),
+    ("CartPole-v1", "mace_full"): (104, 634),
+    ("HopperBulletEnv-v0", "ppo"): (865, 1841),
+    ("HopperBulletEnv-v0", "mace_fixed"): (782, 1801),
+    ("HopperBulletEnv-v0", "mace_full"): (495, 1799),
+}
+
+PAPER_SETTINGS = {  # Paper, Table 2, in its order, as LaTeX; the optimiser, Adam, is the last
+    "actor_learning_rate": "Actor Learning Rate",
+    "critic_learning_rate": "Critic Learning Rate",
+    "discount": r"Discount Factor ($\gamma$)",
+    "epochs": "PPO Epochs ($K$)",
+    "clip": r"PPO Clip Parameter ($\epsilon$)",
+}
+OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is named after its key
+    "gae_lambda": r"GAE Parameter ($\lambda$)",
+    "rollout_steps": "Steps per Update, at least (whole episodes)",
+    "minibatch_size": "Minibatch Size (steps)",
+    "network": "Network of Actor and of Critic",
+    "hidden_units": "Hidden Units of Actor and of Critic",
+    "initial_log_std": "Initial Log Standard Deviation (continuous actions)",
+    "max_gradient_norm": "Maximal Gradient Norm",
+    "normalise_observations": "Normalised Observations",
+}
+
+DIGITS = {"episodes": 0, "return": 1}  # after the point, by a metric's unit
+COLUMNS_PER_BLOCK = 3  # environments, or variants, side by side; more continue below
+
+_LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"<": "$<$", ">": "$>$", "|": "$|$", "±": r"$\pm$", "\u00d7": r"$\times$"}
+    | {"\u2013": "--", "\u2014": "---", "₀": "$_0$", "≤": r"$\leq$", "≥": r"$\geq$"}
+    | {"\u03b1": r"$\alpha$", "β": r"$\beta$", "\u03b3": r"$\gamma$", "δ": r"$\delta$"}
+    | {"ε": r"$\epsilon$", "ϵ": r"$\epsilon$", "η": r"$\eta$", "θ": r"$\theta$"}
+    | {"λ": r"$\lambda$", "μ": r"$\mu$", "\u03c3": r"$\sigma$", "τ": r"$\tau$"}
+)
+
+
+def latex(text: str) -> str:
+    """`text` with LaTeX's special characters escaped and symbols such as β in math mode."""
+    return text.translate(_LATEX)
+
+
+def summary(
+    table: pd.DataFrame, metrics: Sequence[Metric], settings: MetricsConfig
+) -> pd.DataFrame:
+    """The `metrics` averaged over seeds; `table` is the frame of metrics.csv.
+
+    One row per environment, variant and metric, in the order of `table` and `metrics`: `mean`,
+    the bounds `low` and `high` of its interval (NaN with one seed; for a metric in episodes cut to
+    [1, E], where its mean must lie), the number of `seeds`, how many of them are `censored`
+    (counted with E, so the mean is a lower bound), the budget E in `episodes`, and the `paper`'s
+    value (missing where it has none).
+    """
+    rows = []
+    for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
+        published = PAPER_TABLE1.get((environment, variant), (None, None))
+        for metric in metrics:
+            values = runs[metric.name].to_numpy(np.float64)  # [seeds]
+            low, high = mean_interval(  # a generator of its own: no cell depends on another
+                values,
+                settings.confidence,
+                settings.bootstrap_repetitions,
+                np.random.default_rng(settings.bootstrap_seed),
+            )
+            if metric.unit == "episodes":  # a mean of episodes lies among the episodes
+                low, high = np.clip((low, high), 1, runs["episodes"].iloc[0])
+            rows.append(
+                {
+                    "env": environment,
+                    "variant": variant,
+                    "metric": metric.name,
+                    "mean": values.mean(),
+                    "low": float(low),
+                    "high": float(high),
+                    "seeds": len(values),
+                    "censored": int(runs[metric.flag].sum()) if metric.flag in runs else 0,
+                    "episodes": int(runs["episodes"].iloc[0]),
+                    "paper": dict(zip(PAPER_METRICS, published, strict=True)).get(metric.name),
+                }
+            )
+    return pd.DataFrame(rows).astype({"paper": "Int64"})
+
+
+def table1(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The data of table1.csv: `summary` of the paper's two metrics."""
+    papers = [metric for metric in all_metrics(settings) if metric.name in PAPER_METRICS]
+    return summary(table, papers, settings)
+
+
+def supplement(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """`summary` of the other metrics."""
+    return summary(table, companions(settings), settings)
+
+
+def companions(settings: MetricsConfig) -> list[Metric]:
+    """All metrics but the two of Table 1."""
+    return [metric for metric in all_metrics(settings) if metric.name not in PAPER_METRICS]
+
+
+def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig) -> str:
+    """Table 1 in the paper's layout from `table1`: sample efficiency / convergence steps.
+
+    Rows are variants (by their `labels`), columns are environments. Below each pair of means stand
+    their intervals. The lowest mean of each environment and metric is bold, as displayed; ties are
+    all bold, and a mean of seeds that all never got there is not.
+    """
+    environments, variants = list(table["env"].unique()), list(table["variant"].unique())
+    cells = _cells(table)
+    best = {
+        key: _number(group["mean"].min())
+        for key, group in table[table["censored"] < table["seeds"]].groupby(["env", "metric"])
+    }
+
+    def cell(environment: str, variant: str) -> str:
+        rows = [cells[environment, variant, metric] for metric in PAPER_METRICS]
+        bars = [best.get((environment, metric)) for metric in PAPER_METRICS]
+        means = [
+            _mean(row, best=_number(row.mean) == bar) for row, bar in zip(rows, bars, strict=True)
+        ]
+        intervals = "/".join(map(_interval, rows))
+        return _stack(" / ".join(means), rf"{{\scriptsize {intervals}}}")
+
+    blocks = [
+        _tabular(
+            ["Algorithm", *map(latex, block)],
+            [
+                [
+                    [
+                        r"\newline ".join(_label(variant, labels)),
+                        *(cell(name, variant) for name in block),
+                    ]
+                    for variant in variants
+                ]
+            ],
+        )
+        for block in _blocks(environments)
+    ]
+    caption = (
+        "Sample efficiency / convergence steps, in training episodes."
+        " Lower is better for both; the lowest mean is \\textbf{bold}. "
+    )
+    return _float(caption + _how(table, settings.confidence), "tab:table1", blocks)
+
+
+def supplement_latex(
+    table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig
+) -> str:
+    """The companion metrics from `supplement`: columns are variants, groups are environments."""
+    environments, variants = list(table["env"].unique()), list(table["variant"].unique())
+    cells = _cells(table)
+
+    def cell(environment: str, variant: str, metric: Metric) -> str:
+        row, digits = cells[environment, variant, metric.name], DIGITS[metric.unit]
+        return _stack(_mean(row, digits), rf"{{\scriptsize {_interval(row, digits)}}}")
+
+    blocks = [
+        _tabular(
+            ["", *(_stack(*_label(variant, labels)) for variant in block)],
+            [
+                [
+                    [latex(metric.label), *(cell(environment, name, metric) for name in block)]
+                    for metric in companions(settings)
+                ]
+                for environment in environments
+            ],
+            environments,
+        )
+        for block in _blocks(variants)
+    ]
+    caption = "The companion metrics: returns, and in training episodes under other definitions. "
+    return _float(caption + _how(table, settings.confidence), "tab:supplement", blocks)
+
+
+def table2_latex(ppo: Mapping[str, PPOConfig]) -> str:
+    """Table 2, the PPO hyperparameters, from the resolved settings of each environment.
+
+    The paper's six rows, then this project's further settings. A value that is not the same in all
+    environments is shown for each.
+    """
+    own = [name for name in PPOConfig.model_fields if name not in PAPER_SETTINGS]
+    rows = [[label, _setting(ppo, name)] for name, label in PAPER_SETTINGS.items()]
+    rows.append(["Optimizer", "Adam"])
+    further = [
+        [OWN_SETTINGS.get(name, name.replace("_", " ").title()), _setting(ppo, name)]
+        for name in own
+    ]
+    lines = [
+        r"\begin{table}[tbp]",
+        r"\centering",
+        r"\caption{PPO hyperparameters: those of the paper, and below the line those that it leaves"
+        " open.}",
+        r"\label{tab:table2}",
+        r"\par\medskip",
+        r"\footnotesize",
+        r"\begin{tabular}{@{}p{0.42\linewidth}l@{}}",
+        r"\toprule",
+        r"Hyperparameter & Value \\",
+        r"\midrule",
+        *(f"\\raggedright {name} & {value} \\\\" for name, value in rows),
+        r"\midrule",
+        *(f"\\raggedright {name} & {value} \\\\" for name, value in further),
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _float(caption: str, label: str, blocks: Sequence[str]) -> str:
+    """A table as wide as the page, its tabulars below one another."""
+    lines = [
+        r"\begin{table*}[tbp]",
+        r"\centering",
+        rf"\caption{{{caption}}}",
+        rf"\label{{{label}}}",
+        r"\par\medskip",
+        r"\footnotesize",
+        r"\setlength{\tabcolsep}{2pt}",
+        "\n\\par\\medskip\n".join(blocks),
+        r"\end{table*}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _blocks(names: Sequence[str]) -> list[Sequence[str]]:
+    """`names` in parts that fit side by side."""
+    starts = range(0, len(names), COLUMNS_PER_BLOCK)
+    return [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
+
+
+def _tabular(
+    head: Sequence[str], groups: Sequence[Sequence[Sequence[str]]], titles: Sequence[str] = ()
+) -> str:
+    """A tabular of \\textwidth: a head, then groups of rows of cells, each group with its title."""
+    columns = r"p{0.23\textwidth}" + "c" * (len(head) - 1)
+    lines = [
+        rf"\begin{{tabular*}}{{\textwidth}}{{@{{\extracolsep{{\fill}}}}{columns}@{{}}}}",
+        r"\toprule",
+        " & ".join(head) + r" \\",
+    ]
+    for number, rows in enumerate(groups):
+        lines.append(r"\midrule")
+        if titles:
+            title = rf"\textit{{{latex(titles[number])}}}"
+            lines.append(rf"\multicolumn{{{len(head)}}}{{@{{}}l}}{{{title}}} \\")
+            lines.append(r"\addlinespace")
+        printed = [rf"\raggedright {' & '.join(row)} \\" for row in rows]
+        lines.append("\n\\addlinespace\n".join(printed))
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular*}"])
+
+
+def _stack(*lines: str) -> str:
+    """Lines below one another in one cell."""
+    return r"\begin{tabular}[t]{@{}c@{}}" + r"\\".join(lines) + r"\end{tabular}"
+
+
+def _label(variant: str, labels: Mapping[str, str]) -> list[str]:
+    """A variant's name, what is in parentheses on a line of its own."""
+    return latex(labels.get(variant, variant)).replace(" (", "\n(", 1).split("\n")
+
+
+def _cells(table: pd.DataFrame) -> dict[tuple[str, str, str], Any]:
+    """The rows of a `summary` by environment, variant and metric."""
+    return {(row.env, row.variant, row.metric): row for row in table.itertuples()}
+
+
+def _number(value: float, digits: int = 0) -> str:
+    return f"{value:.{digits}f}".replace("-", "$-$")
+
+
+def _mean(row: Any, digits: int = 0, best: bool = False) -> str:
+    """A mean over seeds, bold if it is the best, with the number of censored seeds."""
+    text = _number(row.mean, digits)
+    text = rf"\textbf{{{text}}}" if best else text
+    return text + (rf"$^{{\dagger{row.censored}}}$" if row.censored else "")
+
+
+def _interval(row: Any, digits: int = 0) -> str:
+    if np.isnan(row.low):
+        return "--"
+    return rf"[{_number(row.low, digits)},\,{_number(row.high, digits)}]"
+
+
+def _how(table: pd.DataFrame, confidence: float) -> str:
+    """The part of a caption that says from what the numbers come."""
+    seeds = table["seeds"].min()
+    budgets: dict[str, list[str]] = {}
+    for environment, group in table.groupby("env", sort=False):
+        budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
+        budgets.setdefault(budget, []).append(environment)
+    budget = "; ".join(
+        f"{episodes} episodes ({latex(', '.join(environments))})"
+        for episodes, environments in budgets.items()
+    )
+    level = latex(f"{100 * confidence:g}")
+    kind = {"t": "$t$"}.get(interval_kind(seeds), interval_kind(seeds))
+    text = (
+        "One seed, which allows no interval."
+        if seeds == 1
+        else f"Means over {seeds} seeds and, below, their {level}\\,\\% {kind} intervals."
+    )
+    text += f" Training budget: {budget}."
+    if table["censored"].any():
+        text += (
+            r" $^{\dagger k}$: $k$ of the seeds never got there and count with the whole budget,"
+            " a lower bound."
+        )
+    return text
+
+
+def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str:
+    """The value of one setting, for each group of environments that share it."""
+    environments: dict[str, list[str]] = {}
+    for environment, config in ppo.items():
+        environments.setdefault(_value(getattr(config, name)), []).append(environment)
+    if len(environments) == 1:
+        return next(iter(environments))
+    lines = (f"{value} ({latex(', '.join(names))})" for value, names in environments.items())
+    return r"\begin{tabular}[t]{@{}l@{}}" + r"\\".join(lines) + r"\end{tabular}"
+
+
+def _value(value: Any) -> str:
+    """A setting's value in LaTeX."""
+    match value:
+        case None:
+            return "all steps of the update"
+        case bool():
+            return "yes" if value else "no"
+        case list():
+            return ", ".join(map(_value, value))
+        case CompiledNetwork():
+            return "tanh network"
+        case TorchModule():
+            return latex(value.module)
+        case float() if "e" in repr(value):
+            mantissa, exponent = repr(value).split("e")
+            return rf"${mantissa} \times 10^{{{int(exponent)}}}$"
+        case _:
+            return latex(str(value))

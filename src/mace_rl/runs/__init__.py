@@ -1,0 +1,1 @@
+"""Runs on disk: train, resume, say where results come from, evaluate, verify."""

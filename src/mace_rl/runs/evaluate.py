@@ -1,0 +1,24 @@
+"""Playing with a trained agent."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mace_rl.environments.rollout import draw_noise, rollout_for
+from mace_rl.runs.agent import load_acting
+
+
+def evaluate(directory: Path, episodes: int, seed: int) -> np.ndarray:
+    """Undiscounted extrinsic returns, [episodes], of the agent in `directory`.
+
+    It acts as it did in training, by sampling. Environment and actions draw from `seed`.
+    """
+    environment, policy = load_acting(directory)
+    rollout = rollout_for(environment, policy)
+    generator = np.random.default_rng(seed)
+    environment.env.reset(seed=seed)
+    returns = np.empty(episodes)
+    for episode in range(episodes):
+        played = rollout(environment, policy, draw_noise(environment, generator))
+        returns[episode] = played.rewards.sum()
+    return returns

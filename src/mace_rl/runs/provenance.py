@@ -1,0 +1,83 @@
+"""Where a result comes from: code, versions, machine."""
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).parents[1]
+
+# The packages whose version can change a result.
+PACKAGES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "numba",
+    "llvmlite",
+    "gymnasium",
+    "pybullet",
+    "pybullet-envs-gymnasium",
+)
+
+
+class ProvenanceError(ValueError):
+    """A `run.json` that cannot be trusted; the message names it."""
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Python's version and those of `PACKAGES`."""
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version()} | found
+
+
+def git_state() -> dict[str, Any]:
+    """Commit and whether tracked files differ from it; both None outside a git checkout."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(PACKAGE), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return {
+            "commit": git("rev-parse", "HEAD"),
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no")),
+        }
+    except (FileNotFoundError, subprocess.CalledProcessError):  # no git, or no repository
+        return {"commit": None, "dirty": None}
+
+
+def cpu_model() -> str:
+    """The processor's name as the system gives it."""
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine() -> dict[str, Any]:
+    """Processor, its number of cores, system and C library."""
+    system = " ".join([platform.system(), *platform.libc_ver()])
+    return {"cpu": cpu_model(), "cores": os.cpu_count(), "system": system}
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A `run.json`; `ProvenanceError` if it is not whole."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        missing = {"config", "versions", "sources", "machine", "outputs"} - set(record)
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
+        raise ProvenanceError(f"{path}: not readable: {error}") from None
+    if missing:
+        raise ProvenanceError(f"{path}: the key {min(missing)!r} is missing")
+    return record

@@ -1,0 +1,225 @@
+"""Carrying out one run on disk: train, save checkpoints, resume, write the results.
+
+`mace_rl.files` names the files of a run's folder. The same call resumes to the bit from the
+checkpoint that an interrupted one left.
+"""
+
+import fcntl
+import json
+import logging
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+
+from mace_rl import files, sources
+from mace_rl.config.plugins import source_file
+from mace_rl.config.run import RunConfig
+from mace_rl.files import write_atomically
+from mace_rl.results.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
+from mace_rl.runs import checkpoint, provenance
+from mace_rl.runs.agent import Agent
+from mace_rl.train import Trainer
+
+logger = logging.getLogger(__name__)
+
+PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
+# A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
+CHECKPOINT_SECONDS = 10.0
+CHECKPOINT_COST = 0.01
+# A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
+LOCK_SECONDS = 5.0
+
+
+class RunError(RuntimeError):
+    """A run that cannot be carried out in its folder; the message says why."""
+
+
+def run(
+    config: RunConfig, directory: Path, observe: Callable[[dict[str, Any]], None] | None = None
+) -> None:
+    """Train as `config` says and leave its results in `directory`.
+
+    Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`.
+
+    Continues from its checkpoint if there is one of this very configuration, code and versions;
+    otherwise says so in the log and starts afresh. Uses one thread. Raises `RunError` if another
+    process is at work in `directory`.
+    """
+    torch.set_num_threads(1)
+    directory.mkdir(parents=True, exist_ok=True)
+    with exclusive(directory), threadpool_limits(1):
+        for half_written in directory.glob(".*.tmp"):  # by a process that was killed
+            half_written.unlink()
+        started = time.monotonic()
+        trainer = Trainer(config)
+        identity = run_identity(config)
+        before, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
+        clock = Clock(started - before, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
+        observe = observe or partial(write_progress, directory)
+        for _ in trainer.run():
+            if clock.progress_due():
+                observe(how_far(trainer, clock.elapsed()))
+            if clock.checkpoint_due():
+                with clock.saving():
+                    checkpoint.save(
+                        directory / files.CHECKPOINT,
+                        identity,
+                        {
+                            "trainer": trainer.state_dict(),
+                            "seconds": clock.elapsed(),
+                            "interruptions": interruptions,
+                            "machine": provenance.machine(),
+                        },
+                    )
+        write_results(directory, trainer, identity, clock, interruptions)
+        for name in (files.CHECKPOINT, files.PROGRESS):
+            (directory / name).unlink(missing_ok=True)
+
+
+def run_identity(config: RunConfig) -> dict[str, Any]:
+    """What must be equal for a checkpoint to be continued."""
+    return {
+        "config": config.settings(),
+        "versions": provenance.versions(),
+        "sources": sources.digest(
+            sources.PACKAGE / "runs" / "run.py",
+            *(source_file(reference, key) for key, reference in config.references().items()),
+        ),
+    }
+
+
+def resume(
+    trainer: Trainer, path: Path, identity: dict[str, Any]
+) -> tuple[float, list[dict[str, Any]]]:
+    """Continue from the checkpoint at `path`, if it is this run's.
+
+    Returns the seconds already spent, and for each interruption so far the episode after which the
+    run was continued and the machine that had done the part before.
+    """
+    if not path.exists():
+        return 0.0, []
+    try:
+        state = checkpoint.load(path, identity)
+    except checkpoint.CheckpointError as error:
+        logger.warning("starting afresh: %s", error)
+        return 0.0, []
+    trainer.load_state_dict(state["trainer"])
+    logger.info("resuming after episode %d", len(trainer.records))
+    interruption = {"after_episode": len(trainer.records), "machine": state["machine"]}
+    return state["seconds"], [*state["interruptions"], interruption]
+
+
+class Clock:
+    """Training time, and when progress and checkpoints are due; seconds."""
+
+    def __init__(self, start: float, progress_seconds: float) -> None:
+        self.start = start
+        self.progress_seconds = progress_seconds
+        self.next_progress = time.monotonic()
+        self.next_checkpoint = time.monotonic() + CHECKPOINT_SECONDS
+        self.checkpoint_seconds = 0.0  # spent on checkpoints in this process
+
+    def elapsed(self) -> float:
+        """Seconds of this run, those before interruptions included."""
+        return time.monotonic() - self.start
+
+    def progress_due(self) -> bool:
+        """Whether `progress_seconds` have passed since this last returned True."""
+        now = time.monotonic()
+        if now < self.next_progress:
+            return False
+        self.next_progress = now + self.progress_seconds
+        return True
+
+    def checkpoint_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return time.monotonic() >= self.next_checkpoint
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Measure a checkpoint and set the time of the next."""
+        start = time.monotonic()
+        yield
+        cost = time.monotonic() - start
+        self.checkpoint_seconds += cost
+        self.next_checkpoint = start + max(CHECKPOINT_SECONDS, cost / CHECKPOINT_COST)
+
+
+@contextmanager
+def exclusive(directory: Path) -> Iterator[None]:
+    """Hold the run's folder for this process; the lock goes with the process, however it ends."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        patience = time.monotonic() + LOCK_SECONDS
+        while not locked(descriptor):
+            if time.monotonic() > patience:
+                raise RunError(f"{directory}: another process is training in this folder")
+            time.sleep(0.1)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def locked(descriptor: int) -> bool:
+    """Try to lock an open folder for this process."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def how_far(trainer: Trainer, seconds: float) -> dict[str, Any]:
+    """How far it is after so many seconds of training."""
+    records = trainer.records
+    return {
+        "episode": len(records),
+        "episodes": trainer.config.episodes,
+        "recent_return": float(np.mean([record.extrinsic_return for record in records[-50:]])),
+        "beta": records[-1].beta,
+        "env_steps": records[-1].env_steps,
+        "seconds": seconds,
+        "pid": os.getpid(),
+    }
+
+
+def write_progress(directory: Path, progress: dict[str, Any]) -> None:
+    """Tell whoever watches the folder."""
+    write_atomically(directory / files.PROGRESS, json.dumps(progress))
+
+
+def write_results(
+    directory: Path,
+    trainer: Trainer,
+    identity: dict[str, Any],
+    clock: Clock,
+    interruptions: list[dict[str, Any]],
+) -> None:
+    """Write the records, the agent and, when those are safe, where they come from."""
+    write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
+    write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
+    agent = checkpoint.archive(Agent(trainer.ppo).state_dict())
+    write_atomically(directory / files.AGENT, agent)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux
+    origin = identity | {
+        "code": provenance.git_state(),
+        "machine": provenance.machine(),
+        "threads": torch.get_num_threads(),
+        "seconds": clock.elapsed(),
+        "checkpoint_seconds": clock.checkpoint_seconds,
+        "interruptions": interruptions,
+        "peak_memory_mb": peak / 1024,
+        "outputs": {name: provenance.file_digest(directory / name) for name in files.RESULTS},
+    }
+    write_atomically(
+        directory / files.RECORD, json.dumps(origin, indent=2, ensure_ascii=False) + "\n"
+    )

@@ -1,0 +1,129 @@
+"""Do the runs that this project ships come out again? A sample is repeated and compared to the bit.
+
+On the processor and with the versions they were made with they have to. Elsewhere a last bit may
+differ, and training amplifies it; then the question is by how much, and whether the statistics
+agree.
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mace_rl import files
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import check
+from mace_rl.results.records import RecordError, read_episodes
+from mace_rl.results.statistics import paired_comparison
+from mace_rl.runs.checkpoint import difference
+from mace_rl.runs.provenance import file_digest, read_record
+
+
+class Repetition(NamedTuple):
+    """One run and its repetition."""
+
+    name: str  # environment, variant and seed
+    equal: bool  # records and agent, to the bit
+    first: int | None  # the first episode whose record differs, from 1; None if none does
+    returns: tuple[float, float]  # mean extrinsic return over all episodes, then and now
+    spread: float  # standard deviation of the episodes' returns then
+    origin: str  # what is different in the making of the two
+
+
+def reference_runs(folder: Path) -> list[Path]:
+    """The run folders below `folder`, sorted; `RecordError` if there are none."""
+    runs = sorted(path.parent for path in folder.glob("runs/*/*/seed*/run.json"))
+    if not runs:
+        raise RecordError(f"{folder}: no runs/ENVIRONMENT/VARIANT/seedN/run.json in it")
+    return runs
+
+
+def repeat(run_folder: Path) -> Repetition:
+    """Train as the `run.json` in `run_folder` says, and compare.
+
+    Raises `RecordError` if the files there are not those that `run.json` describes.
+    """
+    from mace_rl.runs.run import run  # PyTorch takes seconds to import
+
+    then = read_record(run_folder / files.RECORD)
+    config = check(RunConfig, then["config"], str(run_folder / files.RECORD))
+    records = run_folder / files.EPISODES
+    before = read_episodes(records, config.episodes)
+    if file_digest(records) != then["outputs"][files.EPISODES]:
+        raise RecordError(f"{records}: not the file that run.json describes (SHA-256 differs)")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        run(config, folder)
+        now = read_record(folder / files.RECORD)
+        after = read_episodes(folder / files.EPISODES, config.episodes)
+    different = (before != after).any(axis=1).to_numpy()
+    origins = [{key: record[key] for key in ("versions", "sources")} for record in (then, now)]
+    for origin, record in zip(origins, (then, now), strict=True):
+        origin["cpu"] = record["machine"]["cpu"]
+    return Repetition(
+        name=f"{config.environment} {config.variant} seed {config.seed}",
+        equal=then["outputs"] == now["outputs"],
+        first=int(different.argmax()) + 1 if different.any() else None,
+        returns=(before["extrinsic_return"].mean(), after["extrinsic_return"].mean()),
+        spread=before["extrinsic_return"].std(),
+        origin=difference(*origins),
+    )
+
+
+def describe(result: Repetition) -> str:
+    """One line on one repetition."""
+    if result.equal:
+        return f"{result.name}: equal to the bit"
+    then, now = result.returns
+    where = f"from episode {result.first}" if result.first else "in the agent's weights only"
+    return (
+        f"{result.name}: different {where}; mean return {then:.2f} then, {now:.2f} now "
+        f"({result.origin})"
+    )
+
+
+def verdict(results: Sequence[Repetition], confidence: float) -> tuple[bool, str]:
+    """Whether the runs are reproduced, and a line that says how.
+
+    Runs that differ still agree if the interval of the mean change of their returns, each in units
+    of its run's spread over episodes, contains 0.
+    """
+    different = [result for result in results if not result.equal]
+    line = f"{len(results) - len(different)} of {len(results)} runs equal to the bit"
+    if not different:
+        return True, line
+    if len(different) == 1:
+        return False, f"{line}; with one that differs, statistics cannot agree or disagree"
+    then, now = np.array([result.returns for result in different]).T
+    spread = np.array([result.spread for result in different])
+    change = paired_comparison(
+        now / spread, then / spread, confidence, 10_000, np.random.default_rng(0)
+    )
+    agree = change.low <= 0 <= change.high
+    return bool(agree), (
+        f"{line}; the others' mean return changed by {change.difference:+.3f} "
+        f"[{change.low:.3f}, {change.high:.3f}] standard deviations of an episode: "
+        f"the statistics {'agree' if agree else 'do not agree'}"
+    )
+
+
+def verify(folder: Path, sample: int | None, seed: int, confidence: float) -> Iterator[str]:
+    """Repeat `sample` runs of `folder` (None: all), chosen with `seed`; yields lines to show.
+
+    The last line is the verdict. Raises `RecordError` for damaged files and `ArithmeticError` if
+    the runs are not reproduced.
+    """
+    runs = reference_runs(folder)
+    if sample is not None and sample < len(runs):
+        chosen = np.random.default_rng(seed).choice(len(runs), sample, replace=False)
+        runs = [runs[i] for i in sorted(chosen)]
+    results = []
+    for run_folder in runs:
+        results.append(repeat(run_folder))
+        yield describe(results[-1])
+    reproduced, line = verdict(results, confidence)
+    if not reproduced:
+        raise ArithmeticError(f"not reproduced: {line}")
+    yield line

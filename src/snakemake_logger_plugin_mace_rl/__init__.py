@@ -1,0 +1,178 @@
+"""What Snakemake's terminal shows of a study, by Snakemake's interface for logger plugins.
+
+    [12:03:10] 12 of 45 runs done, 2 running, 31 waiting; about 3 h 20 min left
+    environment         variant    seed    episode  return     β  steps/s       left
+    HopperBulletEnv-v0  mace_full     3  1204/6000   612.3  0.31     1830
+    CartPole-v1         ppo           0   804/2000   480.1  0.00    11230  1 min 50 s
+
+Snakemake finds this package by its name, and profiles/default/config.yaml chooses it. It follows
+the events of the jobs and reads what the runs tell in their folders, on whichever machine they are.
+"""
+
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable
+from logging import LogRecord
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from snakemake_interface_logger_plugins.base import LogHandlerBase
+from snakemake_interface_logger_plugins.common import LogEvent
+
+from mace_rl import files
+from mace_rl.runs.progress import Countdown, Display, Pace, Run, duration, seconds_left
+
+# What Snakemake says of each job, which stays in its log; of errors, the log of the job says why.
+ROUTINE = [LogEvent(name) for name in ("job_info", "job_started", "job_finished", "job_error")]
+ROUTINE += [LogEvent.PROGRESS, LogEvent.RESOURCES_INFO]
+ROUTINE_ENDS = ("Select jobs to execute...", "exit status 1.", "exit status 130.")
+
+
+class Study:
+    """The runs of a study, of which some are `due` (their wildcards), and what becomes of them.
+
+    `cores` is how many runs this machine carries out at once; None: others do, whatever they can.
+    """
+
+    def __init__(self, runs: Iterable[Run], due: Iterable[tuple], cores: int | None) -> None:
+        self.runs = {run[:3]: run for run in runs}
+        self.waiting = {key: self.runs[key] for key in due}
+        self.begun: dict[Run, Pace] = {}  # or handed to a queue
+        self.ended: Counter[str] = Counter()
+        self.cores = cores
+        self.finished = {r: seconds for r in self.runs.values() if (seconds := r.seconds())}
+        self.starts = [5.0]  # seconds of jobs beside the training; the first is a guess
+        self.countdown, self.without = Countdown(), None
+
+    def begins(self, run: Run) -> None:
+        """Its job was started or handed to a queue."""
+        self.waiting.pop(run[:3], None)
+        self.begun[run] = Pace(stale=run.read(files.PROGRESS))
+
+    def ends(self, run: Run, how: str) -> None:
+        """Its job is done, failed or interrupted."""
+        self.ended[how] += 1
+        pace = self.begun.pop(run)
+        if how == "done" and (seconds := run.seconds()):
+            self.finished[run] = seconds - pace.start_seconds
+            if self.cores:  # elsewhere, it may have waited in a queue
+                self.starts.append(time.monotonic() - pace.begun - self.finished[run])
+
+    def table(self, now: float) -> Any:
+        """How many runs are done, the time left, and a row for each run that trains."""
+        from rich.console import Group
+        from rich.table import Table
+
+        for run, pace in self.begun.items():
+            pace.add(run.read(files.PROGRESS))
+        running = {run: pace for run, pace in self.begun.items() if pace.readings}
+        waiting = [*(self.begun.keys() - running.keys()), *self.waiting.values()]
+        if not (running or waiting):
+            return f"{self.summary()}; tables and figures follow"
+        cores = self.cores or len(running)
+        left, without = seconds_left(self.finished, running, waiting, cores, fmean(self.starts))
+        if without != self.without:  # it is the time left of other runs now
+            self.countdown, self.without = Countdown(), without
+        words = duration(self.countdown.show(left, now))
+        heading = self.summary(len(running))
+        heading += f"; about {words} left" if words else "; time left not known yet"
+        if words and without:
+            heading += f", without {' and '.join(without)}"
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        for run, pace in running.items():
+            row = {"environment": run.env, "variant": run.variant, "seed": run.seed} | pace.cells()
+            for column in () if table.columns else row:
+                text = column in ("environment", "variant")
+                table.add_column(column, justify="left" if text else "right", no_wrap=True)
+            table.add_row(*row.values())
+        return Group(heading, table) if running else heading
+
+    def summary(self, running: int = 0) -> str:
+        """How many runs are done and how many are not."""
+        begun = "starting" if self.cores else "submitted"
+        counts = {"running": running, begun: len(self.begun) - running}
+        counts |= {"waiting": len(self.waiting)} | self.ended
+        done = f"{self.ended['done']} of {sum(counts.values())} runs done"
+        rest = [f"{n} {what}" for what, n in counts.items() if n and what != "done"]
+        return f"[{time.strftime('%H:%M:%S')}] {', '.join([done, *rest])}"
+
+
+class LogHandler(LogHandlerBase):
+    """Shows errors and what Snakemake says of the whole, and below it the runs that train."""
+
+    writes_to_stream = True
+    writes_to_file = has_filter = has_formatter = needs_rulegraph = False
+
+    def __post_init__(self) -> None:
+        self.display = Display(sys.stdout if self.common_settings.stdout else sys.stderr)
+        self.study = Study([], [], None)
+        self.jobs: dict[int, LogRecord] = {}
+        self.closed = threading.Event()
+        self.refreshing = threading.Thread(target=self.refresh, daemon=True)
+
+    def emit(self, record: LogRecord) -> None:
+        """Take in what Snakemake says, and from workflow/rules/terminal.smk which study it is."""
+        try:
+            self.follow(record)
+        except Exception:  # noqa: BLE001  (like every handler: what is shown stops no work)
+            self.handleError(record)
+
+    def follow(self, record: LogRecord) -> None:
+        """Keep account of the jobs and show what is of interest."""
+        event = getattr(record, "event", None)
+        if event == LogEvent.JOB_INFO:
+            self.jobs[record.jobid] = record
+            if run := self.run_of(record):
+                self.study.begins(run)
+        elif event in (LogEvent.JOB_FINISHED, LogEvent.JOB_ERROR):
+            job = self.jobs[record.jobid if event == LogEvent.JOB_ERROR else record.job_id]
+            why = reason(job) if event == LogEvent.JOB_ERROR else None
+            if run := self.run_of(job):
+                well = "done" if event == LogEvent.JOB_FINISHED else "interrupted"
+                self.study.ends(run, "failed" if why else well)
+            if why:
+                self.display.print(why, "red")
+        elif hasattr(record, "study"):
+            self.study = record.study
+            quiet = {choice.name for choice in self.common_settings.quiet or ()}
+            if self.study.waiting and not quiet & {"ALL", "PROGRESS", "RULES"}:
+                self.refreshing.start()
+        routine = event in ROUTINE or str(record.msg).endswith(ROUTINE_ENDS)
+        if self.common_settings.dryrun or not routine:
+            colour = {"WARNING": "yellow", "ERROR": "red"}.get(record.levelname)
+            gap = "\n" if event == LogEvent.JOB_INFO else ""
+            self.display.print(gap + self.format(record), colour)
+
+    def run_of(self, job: LogRecord) -> Run | None:
+        """The run of the study that a job trains; None if it does something else."""
+        return self.study.runs.get(tuple(job.wildcards.values()))
+
+    def refresh(self) -> None:
+        """Keep the table up to date."""
+        while not self.closed.wait(1.0):
+            with self.lock:
+                self.display.show(self.study.table(time.monotonic()))
+
+    def close(self) -> None:
+        """Leave a line that says what was done."""
+        self.closed.set()
+        if self.refreshing.is_alive():
+            self.refreshing.join()
+            self.display.close()
+            self.display.print(self.study.summary())
+        super().close()
+
+
+def reason(job: LogRecord) -> str | None:
+    """Why a job failed, by its log, and where that is; None if it was interrupted."""
+    log = Path(job.log[0])
+    for line in reversed(log.read_text(errors="replace").splitlines() if log.exists() else []):
+        if line.endswith(": interrupted"):
+            return None
+        if " failed: " in line:
+            return f"{line.split(' ', 2)[2]} (more in {log})"
+    names = " ".join([job.rule_name, *job.wildcards.values()])
+    return f"{names} failed: it ended without a word (more in {log})"

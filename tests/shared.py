@@ -1,0 +1,102 @@
+"""What the tests of learning share: an independent derivative, environments, finished runs."""
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork
+from mace_rl.agent.policy import Policy
+from mace_rl.config.run import RunConfig
+from mace_rl.environments.environment import Environment
+from mace_rl.train import Trainer
+
+ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
+VARIANTS = ["ppo", "mace_fixed", "mace_full"]
+LAYER_NORM = {"kind": "torch", "module": "shared:layer_norm"}  # as `ppo.network`
+
+
+class Twin:
+    """A network, or a policy, as its torch module in float64: outputs, gradients by autograd."""
+
+    def __init__(self, owner: Network | Policy) -> None:
+        network = getattr(owner, "network", owner)
+        self.transposed = isinstance(network, CompiledMLP)
+        self.module = copy.deepcopy(network.module()).double()
+        log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
+        self.log_std = torch.nn.Parameter(torch.from_numpy(log_std.astype(np.float64)))
+
+    def parameters(self) -> list[torch.nn.Parameter]:
+        """Every parameter, in the order of the flat vector."""
+        return [*self.module.parameters(), self.log_std]
+
+    def flat(self, tensors: Iterable[torch.Tensor]) -> np.ndarray:
+        """Tensors shaped like `parameters()` as one vector like the network's, or policy's."""
+        arrays = [tensor.detach().numpy() for tensor in tensors]
+        return np.concatenate([(x.T if self.transposed else x).ravel() for x in arrays])
+
+    def gradient(self, loss: torch.Tensor) -> np.ndarray:
+        """∇ loss by autograd, as one vector."""
+        options = {"materialize_grads": True, "retain_graph": True}
+        return self.flat(torch.autograd.grad(loss, self.parameters(), **options))
+
+    def __call__(self, inputs: np.ndarray) -> torch.Tensor:
+        """The outputs, [N, out]."""
+        return self.module(torch.as_tensor(inputs, dtype=torch.float64))
+
+    def policy(self, observations: np.ndarray) -> torch.distributions.Distribution:
+        """π(·|s) as torch.distributions has it."""
+        outputs = self(observations)
+        if len(self.log_std):
+            normal = torch.distributions.Normal(outputs, self.log_std.exp())
+            return torch.distributions.Independent(normal, 1)
+        return torch.distributions.Categorical(logits=outputs)
+
+
+def layer_norm(inputs: int, outputs: int, hidden_units: list[int]) -> torch.nn.Module:
+    """A network of a user's own."""
+    units = hidden_units[0]
+    return torch.nn.Sequential(
+        torch.nn.Linear(inputs, units),
+        torch.nn.LayerNorm(units),
+        torch.nn.ReLU(),
+        torch.nn.Linear(units, outputs),
+    )
+
+
+def environment_of(name: str, seed: int = 0, *settings: Any) -> Environment:
+    """An environment seeded with `seed`."""
+    return Environment(name, np.random.SeedSequence(seed), *settings)
+
+
+def finish(run: RunConfig | Trainer) -> Trainer:
+    """The trainer of a whole run, at its end."""
+    trainer = run if isinstance(run, Trainer) else Trainer(run)
+    for _ in trainer.run():
+        pass
+    return trainer
+
+
+class Bonanza(gymnasium.Env):
+    """Action 1 pays 1, action 0 nothing; in step 3 after the fifth reset `value` goes wrong."""
+
+    observation_space, action_space = Box(-1, 1, (2,), np.float32), Discrete(2)
+
+    def __init__(self, where: str = "nowhere", value: float = 0.0) -> None:
+        self.where, self.value, self.resets = where, value, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.resets, self.steps = self.resets + 1, 0
+        bad = self.where == "first observation" and self.resets == 5
+        return np.full(2, self.value if bad else 0.0, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        add = {self.where: self.value if (self.resets, self.steps) == (5, 3) else 0.0}
+        state = self.np_random.random(2) + add.get("observation", 0.0)
+        return state.astype(np.float32), action + add.get("reward", 0.0), False, False, {}

@@ -1,0 +1,242 @@
+"""The networks: both engines against autograd, the LSTM against PyTorch's, any torch module."""
+
+import copy
+import math
+from functools import partial
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+from scipy import special
+from shared import LAYER_NORM, Twin, layer_norm
+
+from mace_rl.agent import kernels
+from mace_rl.agent.network import CompiledMLP, TorchNetwork, mlp, network
+from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork, meta_network, sigmoid
+from mace_rl.bonus.density import CompiledAutoencoder, DensityEstimator, MaskedAutoencoder
+from mace_rl.config.section import ConfigError
+
+# --- Both engines -------------------------------------------------------------------------------
+
+CASES = []  # compiled form, torch module from a generator, shape of the inputs
+for hidden in ([1], [5], [64, 64], [3, 4, 5]):
+    CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
+for size in (1, 2, 15):
+    CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
+for units, steps in product((1, 5, 128), (1, 2, 32, 300)):
+    CASES.append((CompiledMetaNetwork, partial(MetaNetwork, 7, units, 0.4), (steps, 7)))
+
+
+@pytest.mark.parametrize(("compiled", "make", "shape"), CASES)
+def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
+    """Outputs and gradients with arbitrary weights, biases included, to float32's rounding."""
+    rng = np.random.default_rng(0)
+    module = make(rng)
+    with torch.no_grad():
+        for part in module.parameters():
+            free = (part != 0) | (part.ndim == 1)  # masked weights stay 0
+            part += 0.3 * free * torch.from_numpy(rng.standard_normal(part.shape)).float()
+    inputs = rng.standard_normal(shape).astype(np.float32)
+    double = copy.deepcopy(module).double()
+    expected = double(torch.from_numpy(inputs).double())
+    grad_outputs = rng.standard_normal(expected.shape)
+    loss = (expected * torch.from_numpy(grad_outputs)).sum()
+    gradients = [g.numpy() for g in torch.autograd.grad(loss, double.parameters())]
+    for one in (compiled(module), TorchNetwork(module)):
+        trace = one.forward(inputs)
+        np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
+        found = one.backward(trace, grad_outputs.astype(np.float32))
+        transposed = isinstance(one, CompiledMLP)
+        flat = np.concatenate([(g.T if transposed else g).ravel() for g in gradients])
+        tolerance = 1e-4 * np.abs(flat).max()
+        np.testing.assert_allclose(found, flat, rtol=1e-3, atol=tolerance)
+        assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
+        assert found.shape == one.parameters.shape
+        again = copy.deepcopy(one.module())(torch.from_numpy(inputs)).detach()
+        np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
+
+
+def test_both_engines_start_alike(run_config):
+    inputs = np.random.default_rng(1).standard_normal((9, 6)).astype(np.float32)
+
+    def outputs(engine: str) -> list[np.ndarray]:
+        density = DensityEstimator(6, 8, engine, np.random.default_rng(3))
+        policy = network(run_config().ppo, engine, 6, 2, 0.5, np.random.default_rng(3))
+        meta = meta_network(6, 5, 0.3, engine, np.random.default_rng(3))
+        answers = [one.forward(inputs).outputs for one in (policy, meta)]
+        return [*answers, density.log_prob(inputs), density.gradient(inputs).sum()]
+
+    for one, other in zip(outputs("compiled"), outputs("torch"), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("compiled", "make", "shape"), CASES[3:-1:5])
+def test_a_network_takes_over_the_weights_of_its_module(compiled, make, shape):
+    for wrap in (compiled, TorchNetwork):
+        one, other = (wrap(make(np.random.default_rng(seed))) for seed in (0, 1))
+        held = other.parameters
+        other.load_module_state(copy.deepcopy(one.module().state_dict()))
+        assert (other.parameters == one.parameters).all() and other.parameters is held
+
+
+@pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
+@pytest.mark.parametrize("output_gain", [0.01, 1.0])
+def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
+    layers = list(mlp(sizes, output_gain, np.random.default_rng(0)))[::2]
+    for layer in layers:
+        gain = output_gain if layer is layers[-1] else math.sqrt(2)
+        weights = layer.weight.detach().double().numpy()
+        small = weights if weights.shape[0] <= weights.shape[1] else weights.T
+        expected = gain**2 * np.eye(len(small))
+        np.testing.assert_allclose(small @ small.T, expected, atol=1e-6 * gain**2)
+        assert (layer.bias == 0).all()
+
+
+# --- The meta network ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [1, 40])
+def test_meta_network_is_pytorch_s_lstm_with_a_readout(length):
+    """PyTorch has the gates as input, forget, candidate, output, and two biases."""
+    rng = np.random.default_rng(0)
+    module = MetaNetwork(7, 5, 0.4, rng).double()
+    torch.nn.init.normal_(module.readout, generator=torch.Generator().manual_seed(0))
+
+    def theirs(weights: torch.Tensor) -> torch.Tensor:
+        input_gate, forget_gate, output_gate, candidate = weights.detach().chunk(4, dim=-1)
+        return torch.cat([input_gate, forget_gate, candidate, output_gate], dim=-1).movedim(-1, 0)
+
+    lstm = torch.nn.LSTM(7, 5, dtype=torch.float64)
+    ours = module.weight_ih, module.weight_hh, module.bias, torch.zeros(20)
+    names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
+    lstm.load_state_dict({name: theirs(part) for name, part in zip(names, ours, strict=True)})
+    sequence = torch.from_numpy(2 * rng.standard_normal((length, 7)))
+    _, (hidden, _) = lstm(sequence)
+    expected = (hidden[0] * module.readout).sum() + module.readout_bias
+    torch.testing.assert_close(module(sequence), expected)
+
+
+def test_meta_network_gradient_equals_finite_differences():
+    rng = np.random.default_rng(0)
+    module = MetaNetwork(3, 4, 0.4, rng).double()
+    sequence = torch.from_numpy(rng.standard_normal((6, 3)))
+    names, values = zip(*module.named_parameters(), strict=True)
+
+    def logit(*parameters: torch.Tensor) -> torch.Tensor:
+        weights = dict(zip(names, parameters, strict=True))
+        return torch.func.functional_call(module, weights, sequence)
+
+    assert torch.autograd.gradcheck(logit, values)
+
+
+# --- Compiled functions -------------------------------------------------------------------------
+
+
+@njit(error_model="numpy")
+def over(function, values):
+    """A compiled function of every value, in a loop that becomes vector operations."""
+    result = np.empty_like(values)
+    for i in range(len(values)):
+        result[i] = function(values[i])
+    return result
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_compiled_tanh_and_sigmoid(kind):
+    values = np.concatenate([np.linspace(-12, 12, 10_001), [0.0, 1e-30, 1e30, np.inf, -np.inf]])
+    values = values.astype(kind)
+    exact = np.tanh(values.astype(np.float64))
+    found = over(kernels.tanh, values)
+    assert np.abs(found - exact).max() < 2e-7
+    small = np.abs(values) < 1
+    np.testing.assert_allclose(found[small], exact[small], rtol=4e-7)
+    logistic = special.expit(values.astype(np.float64))
+    assert np.abs(over(sigmoid, values) - logistic).max() < 2e-7
+    for function in (kernels.tanh, sigmoid):  # or a run that goes bad is not noticed
+        assert np.isnan(over(function, np.full(17, np.nan, kind))).all()
+
+
+@pytest.mark.parametrize("hidden", [[1], [64, 64], [3, 4, 5]])
+def test_compiled_forward_of_one_observation_equals_torch(hidden):
+    rng = np.random.default_rng(0)
+    one = CompiledMLP(mlp([6, *hidden, 4], 1.0, rng))
+    one.parameters[:] = rng.standard_normal(len(one.parameters))
+    inputs = rng.standard_normal((50, 6)).astype(np.float32)
+    for observation, row in zip(inputs, Twin(one)(inputs).detach().numpy(), strict=True):
+        found = kernels.forward(observation, one.parameters, one.sizes)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, row, rtol=1e-4, atol=1e-4)
+
+
+# --- Any torch module ---------------------------------------------------------------------------
+
+
+def test_torch_network_is_any_module_and_its_parameters_are_the_flat_vector():
+    torch.manual_seed(0)
+    module = layer_norm(5, 3, [16])
+    one, rng = TorchNetwork(module), np.random.default_rng(0)
+    inputs = rng.standard_normal((20, 5)).astype(np.float32)
+    grad_outputs = rng.standard_normal((20, 3)).astype(np.float32)
+    for memory in (None, np.full(len(one.parameters) + 4, 7, np.float32)):
+        if memory is not None:  # as the policy does, whose own parameters follow
+            before = one.parameters.copy()
+            one.move_to(memory[:-4])
+            assert (one.parameters == before).all() and np.shares_memory(one.parameters, memory)
+            assert (memory[-4:] == 7).all()
+        one.parameters += 0.1 * rng.standard_normal(len(one.parameters)).astype(np.float32)
+        held = torch.cat([part.detach().ravel() for part in module.parameters()])
+        assert (held.numpy() == one.parameters).all()  # views: whoever learns changes the module
+        trace, twin = one.forward(inputs), Twin(one)
+        np.testing.assert_allclose(trace.outputs, twin(inputs).detach(), rtol=1e-4, atol=1e-5)
+        expected = twin.gradient((twin(inputs) * torch.from_numpy(grad_outputs)).sum())
+        for _ in range(2):  # β's credit goes back along one forward pass more than once
+            found = one.backward(trace, grad_outputs)
+            np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    assert one.module() is module
+
+
+class Normalised(torch.nn.Sequential):
+    """Keeps running statistics, which are no parameters."""
+
+    def __init__(self, inputs, outputs, hidden_units):
+        super().__init__(torch.nn.Linear(inputs, outputs), torch.nn.BatchNorm1d(outputs))
+
+
+class Dropping(torch.nn.Sequential):
+    """Drops inputs, and has no bias that would show it if they were 0."""
+
+    def __init__(self, inputs, outputs, hidden_units, p):
+        super().__init__(torch.nn.Dropout(p), torch.nn.Linear(inputs, outputs, bias=False))
+
+
+def headless(inputs, outputs, hidden_units):
+    return torch.nn.Linear(inputs, hidden_units[0])
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "problem"),
+    [
+        ("headless", {}, r"gives \(2, 64\) for inputs \(2, 40\), not \(2, 3\)"),
+        ("Normalised", {}, "keeps state besides its parameters"),
+        ("Dropping", {"p": 0.5}, "gives other outputs the second time"),
+        ("nothing", {}, "has no 'nothing'"),
+    ],
+)
+def test_modules_that_do_not_fit_are_refused_by_name(run_config, module, arguments, problem):
+    own = LAYER_NORM | {"module": f"test_network:{module}", "arguments": arguments}
+    config = run_config(ppo={"network": own}).ppo
+    with pytest.raises(ConfigError, match=rf"ppo\.network\.module.*{module}.*{problem}"):
+        network(config, "compiled", 40, 3, 1.0, np.random.default_rng(0))
+
+
+def test_a_module_of_one_s_own_is_the_same_from_the_same_seed_and_disturbs_nothing(run_config):
+    config = run_config(ppo={"network": LAYER_NORM}).ppo
+    before = torch.get_rng_state()
+    one, same, other = (
+        network(config, "compiled", 5, 3, 1.0, np.random.default_rng(seed)) for seed in (0, 0, 1)
+    )
+    assert isinstance(one, TorchNetwork)
+    assert (one.parameters == same.parameters).all() and (one.parameters != other.parameters).any()
+    assert (torch.get_rng_state() == before).all()
