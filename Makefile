@@ -17,6 +17,8 @@ unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET P
 # A command inside the environment. `python -m` also works where the folder's name has a space.
 IN_VENV := PATH="$$PWD/.venv/bin:$$PATH" .venv/bin/python -m
 SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
+# Each process of the tests takes some 400 MB. What shares a finished study stays in one of them.
+PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
 .DEFAULT_GOAL := all
 .PHONY: all quick test test-quick bench verify kill-test lint lock audit clean help setup
@@ -28,10 +30,10 @@ quick: setup ## the same at small budgets, to see it work (minutes)
 	@$(SNAKEMAKE) all --configfile config/reduced.yaml
 
 test: setup ## every test, on every core
-	@$(IN_VENV) pytest -n auto --dist loadgroup
+	@$(PYTEST)
 
 test-quick: setup ## the tests that take seconds, for the edit loop
-	@$(IN_VENV) pytest -n auto --dist loadgroup -m "not slow"
+	@$(PYTEST) -m "not slow"
 
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)

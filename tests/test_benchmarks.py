@@ -134,6 +134,7 @@ def test_stopwatch_books_nested_time_once_and_what_raises(monkeypatch):
     assert watch.stop() == {"rest": 0.5, "outer": 2, "inner": 10}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("environment", [CARTPOLE, HOPPER])
 @pytest.mark.parametrize("variant", ["ppo", "mace_full"])
 def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, environment, variant):

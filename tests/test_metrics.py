@@ -21,6 +21,7 @@ SETTINGS = {
     "confidence": 0.95,
     "bootstrap_repetitions": 1000,
     "bootstrap_seed": 0,
+    "comparisons": [],
     "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
 }
 CONFIG = check(MetricsConfig, SETTINGS, "test")

@@ -14,6 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 TORCH, CPU_HASH = re.findall(r"^TORCH(?:_CPU_HASH)? := (.*)$", MAKEFILE, re.MULTILINE)

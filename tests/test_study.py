@@ -39,6 +39,8 @@ enviroments: [CartPole-v1]  # 'enviroments', 'environments'
 training: {ppo: {clpi: 0.2}}  # training, 'ppo.clpi', 0.2, 'clip'
 environment_settings: {Acrobot-v1: {episode: 1}}  # settings.Acrobot-v1, 'episode', 'episodes'
 variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capcity', 7, 'capacity'
+metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'mace_full'
+metrics: {comparisons: [[ppo]]}  # metrics.comparisons.0, ['ppo'], 2 items
 variant_settings: {mace_fixed_0.2: {metaa: {}}}  # variant_settings.mace_fixed_0.2, 'metaa', 'meta'
 variant_settings: {mace_full: {beta: {flor: 0}}}  # variant_settings.mace_full, 'beta.flor'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'

@@ -212,11 +212,11 @@ def test_what_a_change_runs_again(finished: Project, edit, name: str) -> None:
 
 def test_a_colour_redraws_the_figures_and_touches_nothing_else(finished: Project, edit) -> None:
     before = finished.digests()
-    edit("config.yaml", "tab:blue", "tab:cyan")
+    edit("config.yaml", "tab:green", "tab:olive")
     assert finished("snakemake -j2 all")[0] == 0
     changed = {name for name, value in finished.digests().items() if value != before[name]}
     assert changed == {"figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"}
-    edit("config.yaml", "tab:cyan", "tab:blue")
+    edit("config.yaml", "tab:olive", "tab:green")
     assert finished("snakemake -j1 all")[0] == 0
     assert finished.digests() == before  # drawing is deterministic
 

@@ -1,5 +1,7 @@
 """How runs are measured, and how Figure 1 is laid out."""
 
+from typing import Annotated
+
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from mace_rl.config.section import ConfigError, Reference, Section
@@ -16,6 +18,8 @@ class MetricsConfig(Section):
     bootstrap_repetitions: int = Field(ge=100)
     bootstrap_seed: NonNegativeInt
     random_return: dict[str, float]  # mean return of uniformly random actions, per environment
+    # Which variant is compared with which, [variant, baseline], where the study has both.
+    comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
     custom: list[Reference] = Field(default=[])  # further ones: mace_rl.results.metrics.Metric
 
     def random_return_in(self, environment: str) -> float:

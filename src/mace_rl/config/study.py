@@ -145,6 +145,11 @@ def load_study(config: Any, origin: str) -> Study:
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
+        for pair in study.metrics.comparisons:
+            for variant in pair:
+                _check_known(
+                    variant, study.variant_settings, "metrics.comparisons", "variant_settings"
+                )
         known = dict.fromkeys(study.environments, "environments")
         known |= dict.fromkeys(study.environment_settings, "environment_settings")
         for environment, key in known.items():

@@ -1,6 +1,5 @@
 """Is one variant better than another? Compared on shared seeds, by environment and metric."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +8,6 @@ import pandas as pd
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.statistics import holm, paired_comparison, probability_of_improvement
-
-BASELINE = "ppo"  # what every other variant is compared with ...
-FULL, FIXED = "mace_full", "mace_fixed"  # ... and the meta network's β with the schedule's
 
 
 class Comparison(NamedTuple):
@@ -33,22 +29,17 @@ class Comparison(NamedTuple):
     probability_high: float
 
 
-def pairs(variants: Sequence[str]) -> list[tuple[str, str]]:
-    """Which of these variants is compared with which."""
-    wanted = [*((variant, BASELINE) for variant in variants if variant != BASELINE), (FULL, FIXED)]
-    return [pair for pair in wanted if set(pair) <= set(variants)]
-
-
 def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of comparisons.csv from the frame of metrics.csv.
 
-    One `Comparison` per environment, metric and pair of variants; none without such a pair.
+    One `Comparison` per environment, metric and configured pair of variants that are both there.
     """
     rows = [
         _compare(runs, metric, pair, settings)
         for _, runs in table.groupby("env", sort=False)
         for metric in all_metrics(settings)
-        for pair in pairs(list(runs["variant"].unique()))
+        for pair in settings.comparisons
+        if set(pair) <= set(runs["variant"])
     ]
     p_values = [row.p_value for row in rows]
     if not np.isnan(p_values).any():  # as with one seed
@@ -58,7 +49,7 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 
 def _compare(
-    runs: pd.DataFrame, metric: Metric, pair: tuple[str, str], settings: MetricsConfig
+    runs: pd.DataFrame, metric: Metric, pair: list[str], settings: MetricsConfig
 ) -> Comparison:
     """One row, but for `p_holm`, from the rows of metrics.csv of one environment."""
     runs = runs[runs["variant"].isin(pair)]
