@@ -96,6 +96,7 @@ def test_example_metric(folder, monkeypatch):
         assert metric.function(curve) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [

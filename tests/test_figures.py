@@ -249,6 +249,7 @@ def test_columns_are_a_positive_number(columns):
         check(FigureConfig, {"columns": columns}, "figure")
 
 
+@pytest.mark.slow
 def test_importing_results_modules_is_quick():
     """Planning the workflow imports them; tables and figures do without torch altogether."""
     heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}

@@ -304,6 +304,7 @@ def test_runs_on_other_machines(tmp_path: Path, handler: LogHandler) -> None:
     handler.close()
 
 
+@pytest.mark.slow
 def test_jobs_do_without_what_draws() -> None:
     code = "import sys, mace_rl.runs.run, mace_rl.runs.progress; sys.exit('rich' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

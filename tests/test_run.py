@@ -114,8 +114,10 @@ SEVERAL = {"rollout_steps": 80, "minibatch_size": 16, "normalise_observations": 
         ("Acrobot-v1", {}),
         ("HopperBulletEnv-v0", {}),
         ("CartPole-v1", {"ppo": SEVERAL}),
-        ("CartPole-v1", {"ppo": SEVERAL, "engine": "torch"}),
-        ("CartPole-v1", {"ppo": SEVERAL | {"network": LAYER_NORM}}),
+        pytest.param("CartPole-v1", {"ppo": SEVERAL, "engine": "torch"}, marks=pytest.mark.slow),
+        pytest.param(
+            "CartPole-v1", {"ppo": SEVERAL | {"network": LAYER_NORM}}, marks=pytest.mark.slow
+        ),
     ],
     ids=[*ENVIRONMENTS, "several", "torch", "LayerNorm"],
 )
@@ -197,6 +199,7 @@ run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), observe)
 """
 
 
+@pytest.mark.slow
 def test_a_run_uses_one_thread(run_config, tmp_path):
     """Whatever the environment says, and in every library, NumPy's BLAS and SciPy's among them."""
     config = run_config("CartPole-v1", "mace_full", 0, episodes=3)
@@ -345,6 +348,7 @@ def test_checkpoint_of_other_versions_or_code_is_not_continued(
     assert "afresh" not in caplog.text
 
 
+@pytest.mark.slow
 def test_identity_covers_every_module_that_training_imports(run_config, monkeypatch):
     """A change in any of them, or in the user's own, makes the checkpoint one of another code."""
     script = (
@@ -372,6 +376,7 @@ class Payload:
         return Path.touch, (self.path,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("writer", ["pickle", "torch"])
 def test_loading_executes_nothing(interrupted, tmp_path, caplog, writer):
     """Even with the right digest in front."""

@@ -4,6 +4,7 @@ import os
 import re
 import shlex
 import sys
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -61,14 +62,19 @@ def most_work(wildcards):
     return steps if config.beta.kind == "none" else 2 * steps
 
 
-def code(script, config=None):
+@cache
+def digest_of(script, *own):
+    """`digest` of a script and files; asked for once for each run, of a thousand alike."""
+    return digest(Path(workflow.basedir, "workflow", "scripts", script), *own)
+
+
+def code(script, settings=None):
     """Digest of a script and of all that it imports of mace_rl, for the `params:` of its rule.
 
-    With a run's `config`, of the user's code that the run names, too. That makes a change of code,
-    by content, a reason to run the job again. As an input it would not: Snakemake goes by an input's
-    time stamp first, and records what it contained when the job ended, so code that was edited
-    meanwhile would pass for the code that ran.
+    With `settings` that name code of the user's own (`references()`), of that too. A change of code,
+    by content, is thus a reason to run the job again. As an input it would not be: Snakemake goes by
+    an input's time stamp first, and records what it contained when the job ended, so code that was
+    edited meanwhile would pass for the code that ran.
     """
-    named = config.references() if config else {}
-    own = [source_file(reference, key) for key, reference in named.items()]
-    return digest(Path(workflow.basedir, "workflow", "scripts", script), *own)
+    named = settings.references() if settings else {}
+    return digest_of(script, *(source_file(reference, key) for key, reference in named.items()))

@@ -209,7 +209,9 @@ def mlp(
 
 def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
     """The layers of `mlp`, with weights that mean nothing."""
-    linear = [torch.nn.utils.skip_init(torch.nn.Linear, *pair) for pair in pairwise(sizes)]
+    generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
+    linear = [torch.nn.Linear(*pair) for pair in pairwise(sizes)]
+    torch.set_rng_state(generator)
     return torch.nn.Sequential(*(part for one in linear for part in (one, torch.nn.Tanh())))[:-1]
 
 
