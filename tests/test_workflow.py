@@ -147,7 +147,10 @@ def test_everything_is_made_and_the_terminal_says_how_far_it_is(finished: Projec
     assert len(logs) == len(RUNS) + sum(EVALUATION.values()) + 1  # Table 2
     assert all(": done in" in log.read_text() for log in logs)
     assert len([*finished["results/benchmarks"].rglob("*.tsv")]) == len(RUNS)
-    assert len([*finished[".snakemake/log"].glob("*.snakemake.log")]) == 2
+    full = [log.read_text() for log in sorted(finished[".snakemake/log"].glob("*.snakemake.log"))]
+    cores = [re.search(r"Provided cores: (\d+)", text)[1] for text in full]
+    assert cores == [str(len(os.sched_getaffinity(0))), "2"]  # without -j, and with
+    assert "rule train:" in full[0]
 
 
 def test_time_stamps_do_not_count(finished: Project) -> None:

@@ -1,9 +1,11 @@
 """What an update did, for whoever wants to know why a run went as it did."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
+from mace_rl.agent.advantages import variance
 from mace_rl.agent.ppo import Update
 from mace_rl.experience import Experience
 from mace_rl.results.records import UpdateRecord
@@ -17,20 +19,23 @@ def diagnose(
     done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
-    def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(item, name) for item in rollout])
+    def stacked(arrays: Iterable[np.ndarray]) -> np.ndarray:
+        first, *others = arrays  # most rollouts are one episode
+        return np.concatenate([first, *others]) if others else first
 
     def explained_variance(kind: str) -> float:
-        advantages, returns = stacked(f"{kind}_advantages"), stacked(f"{kind}_returns")
-        spread = returns.var()  # a return minus the critic's value is the advantage
-        return float(1 - advantages.var() / spread) if spread > 0 else math.nan
+        spread = variance(stacked(getattr(item, f"{kind}_returns") for item in rollout))
+        # A return minus the critic's value is the advantage.
+        left = variance(stacked(getattr(item, f"{kind}_advantages") for item in rollout))
+        return 1 - left / spread if spread > 0 else math.nan
 
     def mean_of(part: str) -> float:
-        parts = [getattr(item.bonus, part) for item in rollout if item.bonus]
-        return float(np.concatenate(parts).mean()) if parts else math.nan
+        values = stacked(getattr(item.bonus, part) for item in rollout)
+        return float(values.sum() / len(values))
 
-    weighted = np.concatenate([item.beta * item.intrinsic_advantages for item in rollout])
-    variances = stacked("extrinsic_advantages").var(), weighted.var()
+    has_bonus = rollout[0].bonus is not None
+    extrinsic = variance(stacked(item.extrinsic_advantages for item in rollout))
+    weighted = variance(stacked(item.beta * item.intrinsic_advantages for item in rollout))
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,
@@ -40,14 +45,14 @@ def diagnose(
         clip_fraction=update.clip_fraction,
         entropy=update.entropy,
         explained_variance_extrinsic=explained_variance("extrinsic"),
-        explained_variance_intrinsic=explained_variance("intrinsic"),
+        explained_variance_intrinsic=explained_variance("intrinsic") if has_bonus else math.nan,
         gradient_norm_actor=update.gradient_norms["actor"],
         gradient_norm_extrinsic=update.gradient_norms["extrinsic"],
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),
-        beta=float(np.mean([item.beta for item in rollout])),
-        bonus_share=float(variances[1] / sum(variances)) if sum(variances) > 0 else math.nan,
-        novelty=mean_of("novelty"),
-        relevance=mean_of("relevance"),
-        similarity=mean_of("similarity"),
+        beta=sum(item.beta for item in rollout) / len(rollout),
+        bonus_share=weighted / (extrinsic + weighted) if extrinsic + weighted > 0 else math.nan,
+        novelty=mean_of("novelty") if has_bonus else math.nan,
+        relevance=mean_of("relevance") if has_bonus else math.nan,
+        similarity=mean_of("similarity") if has_bonus else math.nan,
         beta_credit=math.nan if credit is None else credit,
     )

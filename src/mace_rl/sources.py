@@ -68,7 +68,9 @@ def _imported(file: Path) -> Iterator[Path]:
     """The files of this package that importing `file` runs."""
     own = file.relative_to(PACKAGE.parent).with_suffix("") if file.is_relative_to(PACKAGE) else None
     for node in ast.walk(ast.parse(file.read_bytes(), str(file))):
-        where = f"{file}, line {getattr(node, 'lineno', 0)}"
+        if not isinstance(node, ast.ImportFrom | ast.Import | ast.Constant):
+            continue
+        where = f"{file}, line {node.lineno}"
         match node:
             case ast.ImportFrom(module=module, names=names, level=level):
                 if level:

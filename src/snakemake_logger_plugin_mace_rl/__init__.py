@@ -57,9 +57,9 @@ class Study:
         self.ended[how] += 1
         pace = self.begun.pop(run)
         if how == "done" and (seconds := run.seconds()):
-            self.finished[run] = seconds - pace.start_seconds
+            self.finished[run] = seconds
             if self.cores:  # elsewhere, it may have waited in a queue
-                self.starts.append(time.monotonic() - pace.begun - self.finished[run])
+                self.starts.append(time.monotonic() - pace.begun - seconds)
 
     def table(self, now: float) -> Any:
         """How many runs are done, the time left, and a row for each run that trains."""

@@ -43,3 +43,16 @@ def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
 def root_mean_square(values: np.ndarray) -> float:
     """√(Σ x² / N)."""
     return math.sqrt(values @ values / len(values))
+
+
+@njit(cache=True)
+def variance(values):
+    """Mean squared deviation from the mean of float64 [N]; several times faster than NumPy's."""
+    mean = 0.0
+    for value in values:
+        mean += value
+    mean /= len(values)
+    total = 0.0
+    for value in values:
+        total += (value - mean) ** 2
+    return total / len(values)

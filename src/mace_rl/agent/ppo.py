@@ -46,6 +46,8 @@ class Batch:
 
     def blocks(self) -> Iterator["Batch"]:
         """All steps in order, `BLOCK` at a time."""
+        if len(self) <= BLOCK:
+            return iter([self])
         return (self[start : start + BLOCK] for start in range(0, len(self), BLOCK))
 
 
@@ -146,19 +148,21 @@ class PPO:
         Also the batch's approximate KL divergence, clip fraction and entropy, as in `Update`.
         """
         total: np.ndarray | None = None
-        sums = np.zeros(3)
+        divergence = outside = entropy = 0.0
         for steps in batch.blocks():
             trace = self.policy.forward(steps.observations)
             log_probs = self.policy.log_probs(trace.outputs, steps.actions)
-            weights, divergence, outside = kernels.surrogate_weights(
+            weights, *sums = kernels.surrogate_weights(
                 log_probs, steps.log_probs, steps.advantages, self.config.clip
             )
-            gradient, entropy = self.policy.gradient(
+            gradient, uncertainty = self.policy.gradient(
                 trace, steps.actions, weights, self.config.entropy_coefficient
             )
             total = gradient if total is None else total + gradient
-            sums += divergence, outside, entropy
-        return -(total / np.float32(len(batch))), *(sums / len(batch)).tolist()
+            divergence, outside = divergence + sums[0], outside + sums[1]
+            entropy += uncertainty
+        count = len(batch)
+        return -(total / np.float32(count)), divergence / count, outside / count, entropy / count
 
     def critic_gradient(self, kind: str, batch: Batch) -> np.ndarray:
         """Gradient of the mean squared error of a critic's V(s) against the λ-returns."""

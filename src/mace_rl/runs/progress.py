@@ -20,7 +20,6 @@ from mace_rl import files
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-START_SHARE = 0.01  # of a run's episodes, which take longer: its code is compiled
 # From this share of its episodes on a run's own speed says when it ends. Before, and in a short run
 # later too, its episodes still become longer or shorter as the policy learns.
 OWN_SHARE = 0.3
@@ -46,23 +45,22 @@ class Run(NamedTuple):
             return None
 
     def seconds(self) -> float | None:
-        """How long it took when it was last finished, with as many episodes."""
+        """How long it took without its start, when last finished with as many episodes."""
         record = self.read(files.RECORD)
         try:
-            return record["seconds"] if record["config"]["episodes"] == self.episodes else None
+            seconds = record["seconds"] - record["start_seconds"]
+            return seconds if record["config"]["episodes"] == self.episodes else None
         except (KeyError, TypeError):
             return None
 
 
 class Pace:
-    """The speed of one run, from what it did lately: the second half of its episodes so far."""
+    """The speed of one run, from the last quarter of its episodes so far."""
 
     def __init__(self, stale: Any = None) -> None:
         self.begun = time.monotonic()
         self.now = stale  # the newest reading; `stale` is one of an earlier attempt
         self.readings: deque[Mapping[str, Any]] = deque()
-        # The first episodes take as long as the compilation of all that they use.
-        self.start_seconds = 0.0
 
     def add(self, reading: Mapping[str, Any] | None) -> None:
         """Take in how far the run is."""
@@ -70,17 +68,15 @@ class Pace:
             return
         if self.readings and reading["episode"] < self.now["episode"]:
             self.readings.clear()  # it began again from its checkpoint
-        if reading["episode"] <= max(1, START_SHARE * reading["episodes"]):
-            self.start_seconds = reading["seconds"]
         self.now = reading
         self.readings.append(reading)
-        while len(self.readings) > 2 and 2 * self.readings[1]["episode"] <= reading["episode"]:
+        while len(self.readings) > 2 and 4 * self.readings[1]["episode"] <= 3 * reading["episode"]:
             self.readings.popleft()
 
     @property
     def seconds(self) -> float:
-        """Of training without its start."""
-        return self.now["seconds"] - self.start_seconds
+        """Of training, without its start."""
+        return self.now["seconds"] - self.now["start_seconds"]
 
     def speed(self, what: str) -> float:
         """How many "episode"s or "env_steps" a second; NaN while nobody knows."""

@@ -5,6 +5,7 @@ checkpoint that an interrupted one left.
 """
 
 import fcntl
+import gc
 import json
 import logging
 import os
@@ -32,6 +33,7 @@ from mace_rl.train import Trainer
 logger = logging.getLogger(__name__)
 
 PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
+START_SHARE = 0.01  # of the episodes, which wait for their code to be compiled
 # A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
 CHECKPOINT_SECONDS = 10.0
 CHECKPOINT_COST = 0.01
@@ -61,13 +63,16 @@ def run(
             half_written.unlink()
         started = time.monotonic()
         trainer = Trainer(config)
+        gc.freeze()  # what is there stays: the collector need not look through it again
         identity = run_identity(config)
         before, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
         clock = Clock(started - before, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
         observe = observe or partial(write_progress, directory)
         for _ in trainer.run():
+            if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
+                clock.start_seconds = time.monotonic() - started
             if clock.progress_due():
-                observe(how_far(trainer, clock.elapsed()))
+                observe(how_far(trainer, clock))
             if clock.checkpoint_due():
                 with clock.saving():
                     checkpoint.save(
@@ -123,6 +128,7 @@ class Clock:
 
     def __init__(self, start: float, progress_seconds: float) -> None:
         self.start = start
+        self.start_seconds = 0.0  # of this process until its first episodes were over
         self.progress_seconds = progress_seconds
         self.next_progress = time.monotonic()
         self.next_checkpoint = time.monotonic() + CHECKPOINT_SECONDS
@@ -178,8 +184,8 @@ def locked(descriptor: int) -> bool:
     return True
 
 
-def how_far(trainer: Trainer, seconds: float) -> dict[str, Any]:
-    """How far it is after so many seconds of training."""
+def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
+    """How far it is."""
     records = trainer.records
     return {
         "episode": len(records),
@@ -187,7 +193,8 @@ def how_far(trainer: Trainer, seconds: float) -> dict[str, Any]:
         "recent_return": float(np.mean([record.extrinsic_return for record in records[-50:]])),
         "beta": records[-1].beta,
         "env_steps": records[-1].env_steps,
-        "seconds": seconds,
+        "seconds": clock.elapsed(),
+        "start_seconds": clock.start_seconds,
         "pid": os.getpid(),
     }
 
@@ -215,6 +222,7 @@ def write_results(
         "machine": provenance.machine(),
         "threads": torch.get_num_threads(),
         "seconds": clock.elapsed(),
+        "start_seconds": clock.start_seconds,
         "checkpoint_seconds": clock.checkpoint_seconds,
         "interruptions": interruptions,
         "peak_memory_mb": peak / 1024,
