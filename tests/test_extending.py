@@ -82,6 +82,29 @@ def test_edit_of_the_user_s_file_makes_it_another_run(folder):
     assert json.loads(record.read_text(encoding="utf-8"))["sources"] != before
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "file", "old", "new", "message"),
+    [
+        ("linear_decay", "linear_decay.yaml", ": 0.4", ": 1.5", "episode 1: β is 1.5, which is"),
+        (
+            "grid_counts",
+            "grid_counts.py",
+            "1 / (1",
+            "2 / (1",
+            "the curiosity bonus is 2.0, which is",
+        ),
+    ],
+)
+def test_numbers_out_of_range_stop_the_run_at_once(folder, name, file, old, new, message):
+    text = (folder / file).read_text(encoding="utf-8")
+    assert old in text
+    (folder / file).write_text(text.replace(old, new), encoding="utf-8")
+    done = mace_rl(folder, next(command for command in TRAININGS if command.endswith(name)))
+    assert done.returncode == 1 and message in done.stderr, done.stderr
+    assert not (folder / name / "episodes.csv").exists()
+
+
 def test_example_metric(folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))

@@ -4,7 +4,7 @@ import numpy as np
 
 
 class NonFiniteError(ArithmeticError):
-    """NaN or Inf where a number is needed; the message says in what, and where in the run."""
+    """NaN, Inf or a number out of its range; the message says in what, and where in the run."""
 
 
 def require_finite(name: str, values: float | np.ndarray, where: str = "") -> None:
@@ -13,3 +13,12 @@ def require_finite(name: str, values: float | np.ndarray, where: str = "") -> No
         found = np.asarray(values)
         bad = found[~np.isfinite(found)].ravel()[0]
         raise NonFiniteError(f"{name} is {bad}{where}")
+
+
+def require_share(name: str, values: float | np.ndarray, rounding: float = 0.0) -> None:
+    """Raise `NonFiniteError` unless all `values` are in [0, 1], up to so much `rounding`."""
+    require_finite(name, values)
+    found = np.asarray(values)
+    outside = found[(found < -rounding) | (found > 1 + rounding)].ravel()
+    if len(outside):
+        raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, 1]")

@@ -30,7 +30,7 @@ from mace_rl.diagnostics import diagnose
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
 from mace_rl.experience import Experience, intrinsic_parts, joined, steps, total_advantages
-from mace_rl.finite import NonFiniteError, require_finite
+from mace_rl.finite import NonFiniteError, require_finite, require_share
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows
 from mace_rl.streams import Streams
 
@@ -103,10 +103,10 @@ class Trainer:
         intrinsic = reward, reward
         if self.curiosity and self.controller:
             beta = self.controller.beta
-            require_finite("β", beta)
+            require_share("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
-            require_finite("the curiosity bonus", reward)
+            require_share("the curiosity bonus", reward, rounding=1e-6)
             intrinsic = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
             )
