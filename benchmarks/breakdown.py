@@ -25,10 +25,10 @@ SECTIONS = {
     "bookkeeping": "",
     "critics' values, advantages": "ppo.advantages_and_returns",
     "update: actor": "ppo.actor_gradient ppo.optimisers.actor.step",
-    "update: critics": "ppo.critic_gradient ppo.optimisers.extrinsic.step",
+    "update: critics": "ppo.critics.extrinsic.learn",
 }
 BONUS = {
-    "update: critics": "ppo.optimisers.intrinsic.step",
+    "update: critics": "ppo.critics.intrinsic.learn",
     "novelty: k-NN": "curiosity.novelty.knn_novelty",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.observe",
     "memory": "curiosity.memory.lookup curiosity.memory.write",

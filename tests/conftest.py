@@ -11,7 +11,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import gymnasium
 import pytest
 
-from mace_rl.config.reading import merge
+from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import Study, read_study
@@ -36,7 +36,7 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
         environment: str = "CartPole-v1", variant: str = "ppo", seed: int = 0, **changes: Any
     ) -> RunConfig:
         settings = study.run_config(environment, variant, seed).settings()
-        return check(RunConfig, merge(settings, changes, whole={"beta"}), "the test")
+        return check(RunConfig, merge_layers(settings, changes), "the test")
 
     return make
 

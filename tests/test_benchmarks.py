@@ -143,11 +143,11 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     for _, module, name in breakdown.FUNCTIONS:  # put back after the test
         owner = importlib.import_module(module)
         monkeypatch.setattr(owner, name, getattr(owner, name))
-    plain, profiled = (Trainer(run_config(environment, variant, episodes=4)) for _ in range(2))
-    assert len(list(plain.run())) == 4
+    plain, profiled = (Trainer(run_config(environment, variant, episodes=12)) for _ in range(2))
+    assert len(list(plain.run())) == 12
     watch = breakdown.Stopwatch("bookkeeping")
     breakdown.instrument(profiled, watch)
-    assert len(list(profiled.run())) == 4
+    assert len(list(profiled.run())) == 12
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()

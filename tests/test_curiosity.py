@@ -11,11 +11,9 @@ from mace_rl.bonus.curiosity import Curiosity, relevance
 from mace_rl.environments.rollout import Episode
 from mace_rl.streams import Streams
 
-RETURNS = np.float32([-20, -10, 0, 10, 20])  # mean 0, standard deviation √200
 
-
-def relevance_of(similarity: float, value: float, returns: np.ndarray = RETURNS) -> float:
-    return float(relevance(np.float32([similarity]), np.float32([value]), returns)[0])
+def relevance_of(similarity: float, value: float, worst=-20.0, best=20.0) -> float:
+    return float(relevance(np.array([similarity]), np.float32([value]), worst, best)[0])
 
 
 def episode_of(states, rewards=None, terminated=True) -> Episode:
@@ -44,7 +42,7 @@ def make(run_config):
     def build(environment="CartPole-v1", **changes) -> Curiosity:
         changes = {"memory": {"write_every": 1}, "novelty": {"write_every": 1}} | changes
         config = run_config(environment, "mace_full", 0, **changes)
-        return train.curiosity(config, environment_of(environment), Streams(0))
+        return train.intrinsic_reward(config, environment_of(environment), Streams(0))
 
     return build
 
@@ -56,37 +54,32 @@ def make(run_config):
     ("similarity", "value", "expected"),
     [
         *((0.0, value, 1.0) for value in (-1000.0, 0.0, 1000.0)),  # unlike all: fully relevant
-        # Like what was: the logistic function of value / √200, to 0 where it was unproductive ...
-        *((1.0, 0.0, 0.5), (1.0, -20.0, 0.19557), (1.0, -100.0, 0.00085)),
-        *((1.0, 20.0, 0.80443), (1.0, 100.0, 0.99915)),  # ... and near 1 where it was productive
-        (
-            0.5,
-            10.0,
-            0.83488,
-        ),  # 10 / √200 = 0.7071; the function of it, 0.66976; 1 − ½ (1 − 0.66976)
+        # Like what was: from 0 where it was as bad as it gets to 1 where it was as good ...
+        *((1.0, -20.0, 0.0), (1.0, -10.0, 0.25), (1.0, 0.0, 0.5), (1.0, 20.0, 1.0)),
+        *((1.0, -1000.0, 0.0), (1.0, 1000.0, 1.0)),  # ... and no further
+        (0.5, 10.0, 0.875),  # 1 − ½ (1 − ¾)
     ],
 )
 def test_relevance_by_hand(similarity, value, expected):
-    assert relevance_of(similarity, value) == pytest.approx(expected, abs=1e-5)
+    assert relevance_of(similarity, value) == pytest.approx(expected, abs=1e-6)
 
 
-def test_relevance_does_not_depend_on_the_unit_of_reward():
-    found = relevance_of(0.7, -7.0)
-    other = relevance_of(0.7, -0.07 + 5, RETURNS / 100 + 5)
-    assert found == pytest.approx(other, abs=1e-4)
+@pytest.mark.parametrize(("unit", "shift"), [(1000.0, 0.0), (0.5, 30.0), (0.01, -4.0)])
+def test_relevance_does_not_depend_on_the_unit_of_reward(unit, shift):
+    """Nor on what all returns have in common."""
+    found = relevance_of(0.7, unit * -7.0 + shift, unit * -20 + shift, unit * 20 + shift)
+    assert found == pytest.approx(relevance_of(0.7, -7.0), abs=1e-4)
 
 
-def test_relevance_is_within_0_and_1_even_if_all_returns_are_equal():
-    for returns in (np.zeros(5, np.float32), np.float32([3]), RETURNS):
-        for similarity in (0.0, 0.3, 1.0):
-            for value in (-1e6, 0.0, 3.0, 1e6):
-                assert 0 <= relevance_of(similarity, value, returns) <= 1
-
-
-def test_relevance_is_in_the_middle_if_all_returns_are_equal_up_to_rounding():
-    returns = np.full(1000, 100, np.float32)
-    for value in (100.0, np.nextafter(np.float32(100), np.float32(200))):
-        assert relevance_of(1.0, value, returns) == pytest.approx(0.5, abs=0.1)
+@pytest.mark.parametrize(
+    ("worst", "best"),
+    [(0.0, 0.0), (3.0, 3.0), (100.0, 100.09), (-0.05, 0.04)],
+)
+def test_relevance_is_what_is_not_similar_if_no_return_is_better_than_another(worst, best):
+    """By more than the critic's errors, which would decide else."""
+    for similarity in (0.0, 0.3, 1.0):
+        for value in (worst, best, -1e6, 1e6):
+            assert relevance_of(similarity, value, worst, best) == 1 - similarity
 
 
 # --- The bonus ----------------------------------------------------------------------------------
@@ -99,11 +92,15 @@ def test_first_episode_is_wholly_new(make):
 
 
 def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
-    """Both factors recomputed from the parts on their own, before they take the episode in."""
-    curiosity = make()
+    """Both factors recomputed from the parts on their own, before they take the episode in.
+
+    What is best and worst is what memory holds.
+    """
+    curiosity = make(memory={"write_every": 3})
     for seed in range(5):
-        episode = wander(seed)
-        curiosity.remember(episode, np.random.default_rng(seed).standard_normal(30))
+        returns = np.random.default_rng(seed).standard_normal(30)
+        returns[1:3] = -5.0, 5.0  # steps that are not stored
+        curiosity.remember(wander(seed), returns)
     episode = wander(9, scale=0.6)
     arrived = episode.observations[1:]
     apart = copy.deepcopy(curiosity)
@@ -111,14 +108,15 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
     entries = apart.memory.usage > 0
     mean, std = apart.normaliser.mean, apart.normaliser.std
     keys, values = apart.memory.keys[entries].numpy(), apart.memory.values[entries].numpy()
+    assert len(keys) == 50 + 5 and np.abs(values[:, -1]).max() < 5
     found = curiosity.bonus(episode)
     for t, state in enumerate(arrived):
         squares = (((state - mean) / std - (keys - mean) / std) ** 2).mean(1)
         nearest = np.argsort(squares)[:10]
         kernel = 1 / (squares[nearest] + 0.1)
         recalled = (kernel * values[nearest, -1]).sum() / kernel.sum()
-        z = (recalled - values[:, -1].mean()) / values[:, -1].std()
-        relevant = 1 - 0.1 * kernel.max() * (1 - 1 / (1 + np.exp(-z)))
+        productivity = (recalled - values[:, -1].min()) / np.ptp(values[:, -1])
+        relevant = 1 - 0.1 * kernel.max() * (1 - productivity)
         expected = novelty[t] * relevant, novelty[t], relevant, 0.1 * kernel.max()
         assert [part[t] for part in found] == pytest.approx(expected, rel=1e-3)
 
@@ -171,15 +169,38 @@ def test_different_discrete_states_are_not_similar(make, name):
     assert new > 0.95  # neither visited nor like what was
 
 
-def test_remembering_stores_one_step_in_write_every(make):
-    curiosity = make(memory={"write_every": 4})
-    episode = episode_of(np.arange(44).reshape(11, 4), rewards=range(10))
-    curiosity.remember(episode, np.arange(10) * 10.0)
-    assert len(curiosity.memory) == 3
-    stored = curiosity.memory.values[:3].numpy()
-    assert (curiosity.memory.keys[:3].numpy() == episode.observations[[0, 4, 8]]).all()
-    assert (stored[:, :4] == episode.observations[[1, 5, 9]]).all()
-    assert stored[:, 4:].tolist() == [[0, 0], [4, 40], [8, 80]]
+@pytest.mark.parametrize("write_every", [1, 4, 10])
+def test_memory_holds_one_step_in_write_every_across_episodes_and_each_last(make, write_every):
+    curiosity, expected, count = make(memory={"write_every": write_every}), [], 0
+    for length in (3, 1, 5, 10, 11, 2, 9):
+        states, rewards = np.arange(4 * length + 4).reshape(-1, 4) + 9 * count, range(length)
+        returns = 10.0 * np.arange(length) - count
+        curiosity.remember(episode_of(states, rewards), returns)
+        for t in range(length):
+            if count % write_every == 0 or t == length - 1:
+                expected.append([*states[t], *states[t + 1], rewards[t], returns[t]])
+            count += 1
+    memory = curiosity.memory
+    stored = np.hstack([memory.keys.numpy(), memory.values.numpy()])[: len(memory)]
+    assert stored.tolist() == expected
+
+
+def test_the_outcome_of_a_chain_of_10_steps_is_remembered(make):
+    """Reward at its end only, one step in 10 is written: the first of each episode, and the last.
+
+    Asked of the last state before the end, memory reads three entries of it, at distance 0 with
+    weight 1 / 0.1, and three of the start, at d² = 2 per dimension of 16 with 1 / 2.1.
+    """
+    curiosity = make("FrozenLake-v1", memory={})
+    chain = episode_of(np.eye(16)[:11], rewards=[0] * 9 + [1])
+    for _ in range(3):
+        curiosity.remember(chain, 0.9 ** np.arange(9.0, -1, -1))
+    weights = np.array([1 / 0.1, 1 / 2.1])
+    recalled = weights @ [1, 0.9**9] / weights.sum()
+    productivity = (recalled - 0.9**9) / (1 - 0.9**9)
+    found = curiosity.bonus(chain)
+    assert found.similarity[8] == pytest.approx(1)
+    assert found.relevance[8] == pytest.approx(productivity, rel=1e-4) and productivity > 0.9
 
 
 def test_states_are_compared_in_the_normaliser_of_all_remembered(make):
@@ -204,7 +225,8 @@ def test_appraisal_comes_before_remembering(make):
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
 def test_restored_curiosity_continues_to_the_bit(make, name):
-    original, restored = make(name), make(name)
+    every_fourth = {"memory": {"write_every": 4}, "novelty": {"write_every": 4}}
+    original, restored = make(name, **every_fourth), make(name, **every_fourth)
     rng = np.random.default_rng(0)
 
     def episode() -> Episode:
@@ -212,7 +234,7 @@ def test_restored_curiosity_continues_to_the_bit(make, name):
             return wander(int(rng.integers(1000)))
         return episode_of(np.eye(16)[rng.integers(16, size=31)])
 
-    for _ in range(4):
+    for _ in range(3):  # 90 steps, which end between two that are written
         original.bonus(played := episode())
         original.remember(played, rng.standard_normal(30))
     restored.load_state_dict(copy.deepcopy(original.state_dict()))
@@ -222,3 +244,4 @@ def test_restored_curiosity_continues_to_the_bit(make, name):
         original.remember(played, returns)
         restored.remember(played, returns)
     assert (original.memory.usage == restored.memory.usage).all()
+    assert (original.memory.values == restored.memory.values).all()

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mace_rl.bonus.memory import EpisodicMemory, Recollection
-from mace_rl.bonus.nearest import nearest
 from mace_rl.config.run import MemoryConfig
+from mace_rl.nearest import nearest
 
 ORIGIN, UNIT = torch.zeros(3), torch.ones(3)  # the identity as an embedding
 
@@ -139,7 +139,7 @@ def test_empty_memory_says_so():
     memory = make_memory()
     with pytest.raises(LookupError, match="empty"):
         memory.lookup(torch.zeros(1, 3), ORIGIN, UNIT)
-    assert len(memory) == 0 and len(memory.returns) == 0
+    assert len(memory) == 0
 
 
 # --- Gradients ----------------------------------------------------------------------------------
@@ -187,22 +187,23 @@ class ListOfSlots:
     """Least recently used by its definition: slots with an identity and when they were used."""
 
     def __init__(self, capacity: int, neighbours: int) -> None:
-        self.slots: list[tuple[int, float | None]] = [(0, None)] * capacity
-        self.neighbours, self.time = neighbours, 0
+        self.slots: list[tuple[int, int, float | None]] = [(0, 0, None)] * capacity
+        self.neighbours, self.time, self.written = neighbours, 0, 0
 
     def write(self, keys: list[float]) -> None:
         self.time += 1
         for key in keys[-len(self.slots) :]:
-            oldest = min(range(len(self.slots)), key=lambda i: (self.slots[i][0], i))
-            self.slots[oldest] = (self.time, key)
+            self.written += 1
+            oldest = min(range(len(self.slots)), key=lambda i: (*self.slots[i][:2], i))
+            self.slots[oldest] = (self.time, self.written, key)
 
     def read(self, queries: list[float]) -> None:
         self.time += 1
-        filled = [i for i, (_, key) in enumerate(self.slots) if key is not None]
+        filled = [i for i, (*_, key) in enumerate(self.slots) if key is not None]
         for query in queries:
-            by_distance = sorted(filled, key=lambda i: abs(self.slots[i][1] - query))
+            by_distance = sorted(filled, key=lambda i: abs(self.slots[i][2] - query))
             for i in by_distance[: self.neighbours]:
-                self.slots[i] = (self.time, self.slots[i][1])
+                self.slots[i] = (self.time, *self.slots[i][1:])
 
 
 operations = st.lists(
@@ -237,9 +238,19 @@ def test_replacement_equals_a_model_of_least_recently_used(operations, capacity,
             float(key) if used else None
             for key, used in zip(memory.keys[:, 0], memory.usage > 0, strict=True)
         ]
-        assert held == [key for _, key in model.slots]
+        assert held == [key for *_, key in model.slots]
         assert len(memory) == min(sum(key is not None for key in held), capacity)
-        assert memory.returns.tolist() == [key for key in held if key is not None]
+        assert memory.values[: len(memory), -1].tolist() == [key for key in held if key is not None]
+
+
+def test_of_equal_keys_the_newest_is_read_and_the_oldest_goes():
+    """As with one-hot states, which lie at distance 0 from their like for ever."""
+    memory = make_memory(capacity=4, neighbours=1, key_size=1)
+    zero, one = torch.zeros(1), torch.ones(1)
+    for result in range(6):
+        memory.write(zero[None], zero[None], zero, torch.tensor([float(result)]))
+        assert float(memory.lookup(zero[None], zero, one).values[0, -1]) == result
+    assert sorted(memory.values[: len(memory), -1].tolist()) == [2, 3, 4, 5]
 
 
 def test_values_are_next_state_reward_and_return():

@@ -1,8 +1,11 @@
 """Metrics on curves whose answers are known by hand, and against plain loops."""
 
+import importlib.util
+import re
 import sys
 from decimal import ROUND_CEILING, Decimal
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,16 +16,20 @@ from mace_rl.config.section import ConfigError, check
 from mace_rl.results import metrics as m
 from mace_rl.results.records import RecordError
 
+ROOT = Path(__file__).parents[1]
 SETTINGS = {
     "final_fraction": 0.1,
     "threshold": 0.75,
     "moving_average": 50,
+    "convergence_slope": 0.1,
     "convergence_band": 0.1,
     "confidence": 0.95,
     "bootstrap_repetitions": 1000,
     "bootstrap_seed": 0,
     "comparisons": [],
     "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
+    "reference_return": {"CartPole-v1": 400.0, "Acrobot-v1": -200.0},
+    "solved_return": {"CartPole-v1": 475.0, "Acrobot-v1": -100.0},
 }
 CONFIG = check(MetricsConfig, SETTINGS, "test")
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
@@ -33,16 +40,21 @@ ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "env_steps": 9000,
     "final_return": 500.0,
     "sample_efficiency": 201,
-    "convergence_steps": 300,  # both windows of 50 at 500: episodes 201 to 300
+    "convergence_steps": 295,  # the slope has come down from 480 / 50 to a tenth of that
     "area_under_curve": 404.0,
+    "solved": 1.0,
+    "sample_efficiency_common": 230,  # 22.1 + 0.75 · 377.9 = 305.5: 30 of 50 episodes at 500
     "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
     "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
+    "convergence_steps_steepest": 300,  # both windows of 50 at 500: episodes 201 to 300
     "convergence_steps_flattest": 100,
     "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
     "sample_efficiency_censored": 0,
     "convergence_steps_censored": 0,
+    "sample_efficiency_common_censored": 0,
     "sample_efficiency_range_censored": 0,
     "convergence_steps_range_censored": 0,
+    "convergence_steps_steepest_censored": 0,
     "convergence_steps_flattest_censored": 0,
     "convergence_steps_public_code_censored": 0,
 }
@@ -57,10 +69,11 @@ def ramp(flat_before, rise, flat_after):
     )
 
 
-def curve(returns, final=np.nan, random=np.nan, **settings):
+def curve(returns, final=None, random=-1e9, goals=(), **settings):
     """What a metric gets; settings that are not given are those above."""
-    changed = CONFIG.model_copy(update=settings)
-    return m.LearningCurve(np.asarray(returns), final, random, changed)
+    returns, changed = np.asarray(returns), CONFIG.model_copy(update=settings)
+    final = m.final_return(returns, 0.1) if final is None else final
+    return m.LearningCurve(returns, final, random, changed, *goals)
 
 
 def noisy(seed, episodes=400):
@@ -113,10 +126,14 @@ def test_sample_efficiency_bar_of_negative_returns_lies_above_the_final_return()
 
 
 def test_convergence_is_where_a_ramp_has_left_both_windows_and_not_the_flat_start():
-    # Flat from episode 300 on: both windows of 50 are flat at episode 300 + 99.
+    # Flat from episode 300 on: both windows of 50 are flat at episode 300 + 99. The slope of
+    # the average is 1 while both are on the ramp; k episodes into the flat part the difference
+    # between them has lost k (k + 1) / 2 of 2500, and then 2500 - (99 - k)(100 - k) / 2.
     for flat_before in (0, 200):
-        rise = curve(ramp(flat_before, 300 - flat_before, 1000))
-        assert m.convergence_steps(rise) == (399, False)
+        rise = curve(ramp(flat_before, 300 - flat_before, 1000), random=0)
+        assert m.convergence_steps_steepest(rise) == (399, False)
+        k = next(k for k in range(50, 100) if (99 - k) * (100 - k) / 2 <= 250)
+        assert m.convergence_steps(rise) == (300 + k, False)
     assert m.convergence_steps_flattest(rise) == (100, False)  # the literal reading takes the start
 
 
@@ -127,8 +144,21 @@ def test_convergence_at_the_first_peak_after_the_steepest_rise():
     slopes_by_hand = [0.5, 2.25, 4, 2.25, 0, -0.75, -0.25]  # t = 4, …, 10
     assert m.moving_average(returns, 2).tolist() == averages_by_hand
     assert m.slope(returns, 2).tolist() == slopes_by_hand
-    assert m.convergence_steps(curve(returns, moving_average=2)) == (8, False)
-    assert m.convergence_steps_flattest(curve(returns, moving_average=2)) == (8, False)
+    run = curve(returns, random=0, moving_average=2)  # 75 % of the final 9 is reached at t = 6
+    assert m.convergence_steps(run) == (8, False)
+    assert m.convergence_steps_steepest(run) == (8, False)
+    assert m.convergence_steps_flattest(run) == (8, False)
+    slower = curve(returns, random=0, moving_average=2, convergence_slope=0.6)
+    assert m.convergence_steps(slower) == (7, False)  # 2.25 ≤ 0.6 · 4
+
+
+def test_a_late_collapse_moves_the_steepest_rise_but_not_the_convergence():
+    learnt = ramp(0, 300, 300)
+    collapse = np.concatenate([learnt, np.zeros(50), np.full(600, 300.0)])
+    for returns in (learnt, collapse):
+        assert m.convergence_steps(curve(returns, random=0)) == (378, False)  # k = 78, as above
+    assert m.convergence_steps_steepest(curve(learnt)) == (399, False)
+    assert m.convergence_steps_steepest(curve(collapse)) == (750, False)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -136,29 +166,35 @@ def test_convergence_against_loops(seed):
     returns, window = noisy(seed), 25
     average = averages(returns, window)
     slopes = {t: average[t] - average[t - window] for t in average if t - window in average}
-    run = curve(returns, moving_average=window)
+    run = curve(returns, random=-3.0, moving_average=window)
+    bar, expected = -3 + 0.75 * (np.mean(returns[-40:]) + 3), None
+    for t in slopes:
+        so_far = max(slopes[earlier] for earlier in slopes if earlier <= t)
+        come_far = any(average[earlier] >= bar for earlier in average if earlier <= t)
+        if expected is None and come_far and slopes[t] <= 0.1 * so_far:
+            expected = t
+    assert m.convergence_steps(run) == (expected or 400, expected is None)
     slopes = {t: round(value, 9) for t, value in slopes.items()}
     steepest = max(slopes, key=lambda t: (slopes[t], -t))
     expected = next((t for t in slopes if t >= steepest and slopes[t] <= 0), None)
-    assert m.convergence_steps(run) == (expected or 400, expected is None)
+    assert m.convergence_steps_steepest(run) == (expected or 400, expected is None)
     flattest = min(slopes, key=lambda t: (abs(slopes[t]), t))
     assert m.convergence_steps_flattest(run) == (flattest, False)
 
 
 @pytest.mark.parametrize(
     "returns",
-    [
-        np.full(300, 0.1),
-        np.arange(300.0)[::-1],
-        np.arange(300.0),
-        np.arange(99.0),
-        np.arange(49.0),
-        np.ones(1),
-    ],
-    ids=["constant", "falling", "rising throughout", "two windows short", "one short", "one"],
+    [np.full(300, 0.1), np.arange(300.0)[::-1], np.arange(300.0), np.arange(99.0), np.ones(1)],
+    ids=["constant", "falling", "rising throughout", "two windows short", "one"],
 )
 def test_convergence_that_never_comes_is_censored(returns):
-    assert m.convergence_steps(curve(returns)) == (len(returns), True)
+    assert m.convergence_steps_steepest(curve(returns)) == (len(returns), True)
+    if returns[-1] >= returns[0]:  # which no better than random is, or rising to the end
+        assert m.convergence_steps(curve(returns, random=returns[0])) == (len(returns), True)
+
+
+def test_a_run_that_is_there_from_the_beginning_converges_after_two_windows():
+    assert m.convergence_steps(curve(np.ones(300), random=0)) == (100, False)
 
 
 def test_flattest_needs_two_windows():
@@ -222,12 +258,56 @@ def test_a_collapse_delays_the_convergence_without_floor():
     assert m.convergence_steps_range(curve(returns, 100, 0, moving_average=10)) == (89, False)
 
 
-@pytest.mark.parametrize("final", [-500.0, -499.1, -600.0])
-def test_a_run_no_better_than_random_reaches_nothing(final):
-    for random in (-499.1, final):  # equal: the band has no width, and the average is in it
-        run = curve(np.full(200, final), final, random)
-        assert m.sample_efficiency_range(run) == (200, True)
-        assert m.convergence_steps_range(run) == (200, True)
+NEEDS_LEARNING = [
+    *(m.sample_efficiency, m.sample_efficiency_range, m.convergence_steps),
+    *(m.convergence_steps_range, m.convergence_steps_steepest, m.convergence_steps_flattest),
+]
+
+
+@pytest.mark.parametrize("metric", NEEDS_LEARNING)
+def test_a_run_no_better_than_random_reaches_nothing(metric):
+    returns = np.array([-20.0] * 40 + [0.0] * 160)
+    for random in (0.0, 1.0):  # 75 % of 0 is reached in episode 41
+        assert metric(curve(returns, random=random)) == (200, True)
+    assert not metric(curve(returns, random=-1.0)).censored
+
+
+def test_better_than_random_is_more_than_two_standard_errors():
+    returns = np.array([0.0] * 180 + [2.0, 0.0] * 10)  # the last 20: mean 1, error 1 / √20
+    assert curve(returns, random=1 - 2.01 / np.sqrt(20)).learned
+    assert not curve(returns, random=1 - 1.99 / np.sqrt(20)).learned
+
+
+def test_of_runs_that_act_at_random_nearly_all_are_censored():
+    """That the mean of the last episodes is not above random would let half of them pass."""
+    draws = np.random.default_rng(0).gamma(4, 22.1 / 4, size=(1000, 500))
+    ends = [m.final_return(returns, 0.1) for returns in draws]
+    assert np.mean(np.array(ends) > 22.1) == pytest.approx(0.5, abs=0.05)
+    runs = [m.sample_efficiency(curve(returns, random=22.1)) for returns in draws]
+    assert np.mean([run.censored for run in runs]) > 0.96
+
+
+def test_one_bar_for_all_does_not_fall_when_a_run_ends_worse():
+    # Window 10, random 0, reference 100: 8 of 10 episodes at 100 are above 75.
+    good = np.array([0.0] * 30 + [100.0] * 70)
+    worse = np.array([0.0] * 20 + [60.0] * 80)
+    found = [
+        [
+            metric(curve(returns, None, 0.0, (100.0,), moving_average=10))
+            for returns in (good, worse)
+        ]
+        for metric in (m.sample_efficiency_range, m.sample_efficiency_common)
+    ]
+    assert found == [[(38, False), (28, False)], [(38, False), (100, True)]]
+    # Reached is reached, whatever comes after.
+    assert m.sample_efficiency_common(
+        curve(good[::-1], None, 0.0, (100.0,), moving_average=10)
+    ) == (10, False)
+
+
+def test_solved_is_a_share_of_the_last_episodes():
+    run = curve(np.arange(40.0), None, 0.0, (np.nan, 37.0))
+    assert m.solved(run) == 0.75  # 37, 38 and 39 of 36 to 39
 
 
 def test_a_run_shorter_than_the_window_is_censored():
@@ -243,6 +323,26 @@ def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
     np.testing.assert_allclose(
         m.moving_average(noisy(0), 25), pd.Series(noisy(0)).rolling(25).mean().dropna()
     )
+
+
+def test_the_reading_of_table_1_is_steady_and_sees_a_delay(monkeypatch):
+    """What docs/metrics.md chooses it by, with fewer curves."""
+    path = ROOT / "tools" / "convergence_simulation.py"
+    spec = importlib.util.spec_from_file_location("convergence_simulation", path)
+    spec.loader.exec_module(tool := importlib.util.module_from_spec(spec))
+    monkeypatch.setattr(tool, "REPEATS", 30)
+    named = {reading: name for name, reading in tool.READINGS.items()}
+    for shape in tool.SHAPES:
+        cells = dict(zip(tool.READINGS, tool.column(shape), strict=True))
+        spread, order = (
+            {name: float(re.split("±|,", cell)[part]) for name, cell in cells.items()}
+            for part in (1, 2)
+        )
+        chosen = named[m.convergence_steps]
+        assert spread[chosen] < 3.5 and order[chosen] > 98
+        assert order[named[m.convergence_steps_public_code]] < 60 or shape == "two steps"
+        if shape in ("CartPole", "Hopper"):  # late collapses, drift
+            assert spread[named[m.convergence_steps_steepest]] > 4 * spread[chosen]
 
 
 # rows, the table, the file
@@ -351,7 +451,7 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
     )
     result = table(settings=settings)
     added = ["positive", "worst", "positive_censored"]
-    assert list(result.columns) == [*COLUMNS[:13], *added[:2], *COLUMNS[13:], added[2]]
+    assert list(result.columns) == [*COLUMNS[:16], *added[:2], *COLUMNS[16:], added[2]]
     pd.testing.assert_frame_equal(result[COLUMNS], table())
     for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
         returns = run["extrinsic_return"].tolist()
@@ -372,7 +472,7 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
         (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
         (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
         (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
-        (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have episodes or"),
+        (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
     ],
 )
 def test_what_is_no_metric_is_refused(own, problem, custom):
@@ -404,6 +504,8 @@ REFUSED = {
     "confidence": (95,),
     "bootstrap_repetitions": (99,),
     "bootstrap_seed": (-1,),
+    "convergence_slope": (-0.1, 1.0),
+    "regret": ({"variant": "mace_full", "constants": []},),
     "random_return": (22.1, *({"CartPole-v1": value} for value in (np.nan, np.inf, "22", True))),
     "custom": (["own_metrics.POSITIVE"], ["own metrics:POSITIVE"]),
 }
@@ -412,5 +514,44 @@ REFUSED = {
 @pytest.mark.parametrize("key", REFUSED)
 def test_a_setting_that_cannot_be_is_refused(key):
     for value in REFUSED[key]:
-        with pytest.raises(ConfigError, match=rf"test: {key}(\.CartPole-v1|\.0)? is "):
+        with pytest.raises(ConfigError, match=rf"test: {key}(\.CartPole-v1|\.0|\.constants)? is "):
             check(MetricsConfig, SETTINGS | {key: value}, "test")
+
+
+def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
+    def names(environments, **changes):
+        settings = check(MetricsConfig, SETTINGS | changes, "test").within(environments, ["ppo"])
+        return [metric.name for metric in m.all_metrics(settings) if metric.needs]
+
+    assert names(ENVIRONMENTS) == ["solved", "sample_efficiency_common"]
+    assert names(["CartPole-v1", "Other-v0"]) == []
+    assert names(ENVIRONMENTS, solved_return={"CartPole-v1": 475.0}) == ["sample_efficiency_common"]
+    assert names(["CartPole-v1"], reference_return={}) == ["solved"]
+    columns = table(settings=CONFIG.within([*ENVIRONMENTS, "Other-v0"], VARIANTS)).columns
+    assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (
+            {"solved_return": {"CartPole-v1": 22.1}},
+            r"metrics\.solved_return\.CartPole-v1 is 22\.1, but should be greater than .*, 22\.1",
+        ),
+        (
+            {"regret": {"variant": "mace_full", "constants": ["ppo", "beta_0.1"]}},
+            r"metrics\.regret has 'beta_0\.1', which is not in variants",
+        ),
+    ],
+)
+def test_what_does_not_fit_the_study_is_refused(change, problem):
+    with pytest.raises(ConfigError, match=problem):
+        check(MetricsConfig, SETTINGS | change, "test").within(ENVIRONMENTS, VARIANTS)
+
+
+def test_every_metric_is_in_the_documentation():
+    text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)`.*?\| (\w+) \|", text, re.MULTILINE)
+    units = {"episodes": "episode"}
+    listed = {metric.name: units.get(metric.unit, metric.unit) for metric in m.METRICS}
+    assert listed.items() <= dict(rows).items()

@@ -1,10 +1,11 @@
-"""Novelty: counts by hand, k-NN by brute force, and what it is for: the new against the known."""
+"""Novelty: counts by hand, the rest by brute force, and what it is for: the new and the known."""
 
 import copy
 import math
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.novelty import CountNovelty, DensityNovelty
@@ -31,8 +32,8 @@ def settings(**changes) -> NoveltyConfig:
     )
 
 
-def make(seed=0, **changes) -> DensityNovelty:
-    normaliser = RunningNormaliser(SIZE)
+def make(seed=0, size=SIZE, **changes) -> DensityNovelty:
+    normaliser = RunningNormaliser(size)
     return DensityNovelty(settings(**changes), "compiled", normaliser, Streams(seed))
 
 
@@ -45,6 +46,11 @@ def observe(novelty: DensityNovelty, states: np.ndarray) -> None:
 def cluster(count, centre=0.0, scale=1.0, seed=0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return (centre + scale * rng.standard_normal((count, SIZE))).astype(np.float32)
+
+
+def line(*places: float) -> np.ndarray:
+    """States in one dimension."""
+    return np.float32(places)[:, None]
 
 
 def one_hot(*states: int) -> np.ndarray:
@@ -76,66 +82,59 @@ def test_a_state_not_visited_for_long_is_new_again():
     assert values == sorted(values) and values[0] < 0.04 and 0.98 < values[-1] <= 1
 
 
-# --- k-NN ---------------------------------------------------------------------------------------
+# --- k-NN and density ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("visited", [1, 2, 7, 40])
-def test_knn_part_equals_brute_force(visited):
-    """Also with fewer visited states than neighbours asked for."""
-    novelty = make()
-    known, states = cluster(visited, scale=[1, 10, 0.1]), cluster(15, 0.5, [2, 20, 0.2], seed=1)
-    observe(novelty, known)
+def brute_distances(states, known, skip=0) -> np.ndarray:
+    """Mean distance to the nearest 1, 3 and 8 of the known, in their deviations, [N, 3]."""
     std = known.std(0, dtype=np.float64)
     std[std == 0] = 1
-    for found, state in zip(novelty.knn_novelty(states), states, strict=True):
-        distances = sorted(
-            math.sqrt(sum(((state[d] - other[d]) / std[d]) ** 2 for d in range(SIZE)) / SIZE)
-            for other in known
-        )
-        ensemble = []
-        for k in (1, 3, 8):
-            nearest = distances[: min(k, visited)]
-            ensemble.append(1 - math.exp(-sum(nearest) / len(nearest)))
-        assert found == pytest.approx(sum(ensemble) / 3, rel=1e-4)
+    ordered = np.sort(cdist(states / std, known / std), axis=1)[:, skip:]
+    return np.stack([ordered[:, :k].mean(1) for k in (1, 3, 8)], axis=1)
 
 
-def test_buffer_keeps_the_last_states():
-    novelty = make(buffer_size=7)
-    states = np.arange(60, dtype=np.float32).reshape(20, SIZE)
-    seen: list[list[float]] = []
-    for part in np.split(states, [4, 6, 11, 12]):  # one part is longer than the buffer
-        observe(novelty, part)
-        seen += part.tolist()
-        assert sorted(novelty.visited.tolist()) == seen[-7:]
-
-
-def test_one_state_in_write_every_enters_the_buffer():
-    novelty = make(write_every=4)
-    states = np.arange(30, dtype=np.float32).reshape(10, SIZE)
-    observe(novelty, states)
-    observe(novelty, states[:1])
-    assert novelty.visited.tolist() == states[[0, 4, 8, 0]].tolist()
-
-
-# --- Density ------------------------------------------------------------------------------------
-
-
-def test_density_part_is_the_share_of_visited_states_that_are_denser():
-    novelty = make(density_batch_size=256, density_learning_rate=1e-7)
-    observe(novelty, cluster(50))
-    states = np.concatenate([cluster(20, scale=0.5, seed=1), cluster(20, 2.0, seed=2)])
+@pytest.mark.parametrize("visited", [9, 40])
+@pytest.mark.parametrize("scale", [[1, 10, 0.1], [1, 10, 0], [0, 10, 0]])
+def test_both_parts_equal_brute_force(visited, scale):
+    """Also if some dimensions are constant, which D does not count."""
+    novelty, scale, dimensions = make(), np.array(scale), np.count_nonzero(scale)
+    known, states = cluster(visited, 2, scale), cluster(15, 2 + scale / 2, 1.5 * scale, seed=1)
+    observe(novelty, known)
+    batches = Streams(0)["density_batches"].integers(visited, size=(2, 64))
+    sample = known[batches[-1]]
+    usual = np.sort(brute_distances(sample[:32], known, skip=1), axis=0)
+    usual = 0.1 * usual[27] + 0.9 * usual[28]  # place 27.9 of 0 to 31 is 90 % of the way
+    np.testing.assert_allclose(novelty.usual_distances, usual, rtol=1e-4)
+    beyond = 1 - usual / brute_distances(states, known)
+    found = novelty.knn_novelty(states)
+    np.testing.assert_allclose(found, np.where(beyond > 0, beyond, 0).mean(1), atol=1e-4)
+    assert (found > 0).any()
 
     def log_density(points: np.ndarray) -> np.ndarray:
-        return novelty.density.log_prob(novelty.normaliser(points))
+        std = known.std(0, dtype=np.float64)
+        points = (points - known.mean(0, dtype=np.float64)) / np.where(std > 0, std, 1)
+        return novelty.density.log_prob(points.astype(np.float32)).astype(np.float64)
 
-    denser = log_density(novelty.visited)[None, :] > log_density(states)[:, None]
-    # The reference is 256 draws with replacement from the 50 visited.
-    np.testing.assert_allclose(novelty.density_novelty(states), denser.mean(1), atol=0.12)
+    lack = np.quantile(log_density(sample), 0.1) - log_density(states)
+    expected = [1 - math.exp(-nats / dimensions) if nats > 0 else 0.0 for nats in lack]
+    np.testing.assert_allclose(novelty.density_novelty(states), expected, atol=1e-4)
+    assert 0 < np.count_nonzero(expected) < 15
+
+
+def test_constant_dimensions_do_not_shrink_distances():
+    narrow, wide = make(), make(size=SIZE + 5)
+    constant = np.full((40, 5), 7, np.float32)
+    observe(narrow, cluster(40))
+    observe(wide, np.hstack([cluster(40), constant]))
+    states = cluster(10, 0.5, 2, seed=1)
+    found = wide.knn_novelty(np.hstack([states, constant[:10]]))
+    np.testing.assert_allclose(found, narrow.knn_novelty(states), rtol=1e-4)
+    assert found.max() > 0.3
 
 
 def test_observing_trains_the_density_estimator():
     """Held-out states of the visited distribution become likelier, episode by episode."""
-    novelty = make(buffer_size=2000, density_steps=10)
+    novelty = make(buffer_size=3000, density_steps=10)
     held_out = cluster(500, seed=99)
     likelihood = []
     for episode in range(60):
@@ -146,11 +145,79 @@ def test_observing_trains_the_density_estimator():
     assert likelihood[-1] == pytest.approx(-entropy, abs=0.15)
 
 
+# --- The buffer ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("write_every", [1, 3, 4])
+def test_one_state_in_write_every_enters_the_buffer_across_episodes(write_every):
+    """Also of episodes shorter than that; until the buffer is full, nothing goes."""
+    novelty, states = make(write_every=write_every), np.arange(99, dtype=np.float32).reshape(33, 3)
+    for part in np.split(states, [3, 4, 6, 7, 10, 21, 22]):
+        observe(novelty, part)
+    assert novelty.visited.tolist() == states[::write_every].tolist()
+
+
+def test_a_full_buffer_takes_what_is_far_for_what_is_redundant():
+    """One state at a time; 200 draws of 5 find all that is redundant."""
+    novelty = make(size=1, buffer_size=5, neighbours=[1], calibration_states=200)
+
+    def after(*places: float) -> list[float]:
+        for place in places:
+            observe(novelty, line(place))
+        return sorted(novelty.visited.ravel().astype(float).round(3).tolist())
+
+    observe(novelty, line(0, 1, 1.1, 10, 10.3))
+    one = after(20)  # takes the place of 1 or 1.1
+    assert one in ([0, 1, 10, 10.3, 20], [0, 1.1, 10, 10.3, 20])
+    two = after(5)  # 10 or 10.3
+    assert two in ([0, one[1], 5, 10, 20], [0, one[1], 5, 10.3, 20])
+    assert after(5.5, 0.4, 19.9, 4.2) == two  # nearer to others than any of these to each other
+    observe(novelty, line(4.99, 30, 0.01))  # of several at once the farthest
+    assert 30 in novelty.visited and not np.isin(line(4.99, 0.01), novelty.visited).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_states_visited_only_long_ago_stay_known(seed):
+    """20 states far out, then 4000 elsewhere: of the last 200 the first would be new."""
+    novelty = make(seed, buffer_size=200, neighbours=[1, 3])
+    parts = [cluster(20, 8, 0.5, seed=1000 * seed)]
+    parts += [cluster(20, seed=1000 * seed + n) for n in range(1, 201)]
+    for part in parts:
+        observe(novelty, part)
+    again, elsewhere = cluster(20, 8, 0.5, seed=99), cluster(20, -8, 0.5, seed=99)
+    window = make(seed, buffer_size=200, neighbours=[1, 3])
+    window.normaliser = novelty.normaliser
+    window.observe(np.concatenate(parts)[-200:])
+    assert window.knn_novelty(again).mean() > 0.8 and novelty.knn_novelty(elsewhere).mean() > 0.8
+    assert novelty.knn_novelty(again).mean() < 0.4
+    visited = {tuple(state) for part in parts for state in part.tolist()}
+    kept = {tuple(state) for state in novelty.visited.tolist()}
+    assert kept <= visited and len(kept) == 200
+
+
+@pytest.mark.parametrize(
+    ("known", "states"),
+    [
+        ([0, 1, 2, 30, 30], [10, 20]),  # of a redundant pair both go
+        ([0, 1, 2, 3, 30], [100, 100.1, 100.2, 100.3, 100.4]),  # all that was known goes
+    ],
+)
+def test_a_region_is_not_forgotten_within_an_episode(known, states):
+    novelty = make(size=1, buffer_size=5, neighbours=[1], calibration_states=200)
+    observe(novelty, line(*known))
+    observe(novelty, line(*states))
+    assert 30 in novelty.visited
+
+
 # --- The whole ----------------------------------------------------------------------------------
 
 
-def test_before_anything_was_visited_all_is_new():
-    assert make()(cluster(5)).tolist() == [1.0] * 5
+def test_until_more_than_the_neighbours_were_visited_all_is_new():
+    novelty = make()  # of 8 neighbours
+    assert novelty(cluster(5)).tolist() == [1.0] * 5
+    for count, new in ((8, True), (1, False)):
+        observe(novelty, cluster(count))
+        assert (novelty(cluster(5)).tolist() == [1.0] * 5) == new
 
 
 def test_parts_are_weighted():
@@ -174,20 +241,37 @@ def test_novelty_is_within_0_and_1():
 
 
 @pytest.mark.parametrize("density_steps", [2, 20])
-def test_repeated_states_lose_novelty_and_far_ones_keep_it(density_steps):
-    novelty = make(buffer_size=500, density_steps=density_steps)
-    means = []
+def test_novelty_falls_where_the_agent_stays_and_not_where_it_has_not_been(density_steps):
+    novelty, stays, away = make(buffer_size=500, density_steps=density_steps), [], []
     for episode in range(40):
         states = cluster(20, seed=episode)
-        means.append(novelty(states).mean())
+        stays.append(novelty(states).mean())
+        away.append(novelty(cluster(20, 30.0)).min())
         observe(novelty, states)
-    assert means[0] == 1 and np.mean(means[-5:]) < 0.45
-    assert np.mean(means[-5:]) < np.mean(means[1:6])
-    assert (novelty(cluster(20, centre=30.0)) > 0.99).all()
-    # Exactly the states in the buffer: nothing left in the nearest-neighbour part of k = 1.
-    exact = make(buffer_size=500, neighbours=[1])
-    observe(exact, cluster(20))
-    assert (exact.knn_novelty(cluster(20)) == 0).all()
+    assert stays[0] == 1 and max(stays[1:]) < 0.3 and np.mean(stays[-20:]) < 0.1
+    assert min(away) > 0.95
+
+
+def test_a_new_region_is_new_until_it_was_visited():
+    novelty = make(buffer_size=500)
+    for episode in range(20):
+        observe(novelty, cluster(20, seed=episode))
+    found = []
+    for episode in range(5):
+        states = cluster(20, 8.0, seed=100 + episode)
+        found.append(novelty(states).mean())
+        observe(novelty, states)
+    assert found[0] > 0.9 and found[1] < 0.5 and found[-1] < 0.2
+
+
+@pytest.mark.parametrize("cells", [1, 5])
+def test_states_that_repeat_exactly_are_known(cells):
+    """A grid of positions, or an observation that never changes."""
+    novelty, rng = make(size=2, buffer_size=500), np.random.default_rng(0)
+    grid = np.float32([(i, j) for i in range(cells) for j in range(cells)])
+    for _ in range(50):
+        observe(novelty, grid[rng.integers(len(grid), size=20)])
+    assert novelty(grid).mean() < 0.2
 
 
 def test_units_do_not_matter():
@@ -203,16 +287,19 @@ def test_units_do_not_matter():
 
 
 def test_restored_novelty_continues_to_the_bit():
-    original, restored = make(buffer_size=30), make(seed=1, buffer_size=30)
-    for episode in range(3):
+    """With a buffer that is full, and in the middle of the steps between two that are written."""
+    settings_ = {"buffer_size": 20, "write_every": 2}
+    original, restored = make(**settings_), make(seed=1, **settings_)
+    for episode in range(5):
         observe(original, cluster(13, seed=episode))
     restored.load_state_dict(copy.deepcopy(original.state_dict()))
     restored.normaliser.load_state_dict(original.normaliser.state_dict())
-    for episode in range(3, 6):
+    for episode in range(5, 9):
         states = cluster(13, seed=episode)
         assert (original(states) == restored(states)).all()
         observe(original, states)
         observe(restored, states)
+    assert (original.visited == restored.visited).all() and original(states).max() < 1
     counts, others = CountNovelty(settings(), 4), CountNovelty(settings(), 4)
     counts.observe(one_hot(0, 1, 1))
     others.load_state_dict(counts.state_dict())

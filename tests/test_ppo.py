@@ -104,14 +104,20 @@ def test_advantages_are_the_weighted_mean_of_k_step_ones(discount, gae_lambda):
 @pytest.mark.parametrize("kind", ["extrinsic", "intrinsic"])
 @pytest.mark.parametrize("gae_lambda", [0.9, 1.0])
 @pytest.mark.parametrize("terminated", [True, False])
-def test_truncation_bootstraps_and_termination_never(make_ppo, kind, gae_lambda, terminated):
-    ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda)
+@pytest.mark.parametrize("scaled", [True, False])
+def test_truncation_bootstraps_and_termination_never(
+    make_ppo, kind, gae_lambda, terminated, scaled
+):
+    """Of rewards as they are, or over the deviation of their discounted sums, these included."""
+    ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda, scale_rewards=scaled)
     rng = np.random.default_rng(2)
-    observations, rewards = rng.standard_normal((6, 4)).astype(np.float32), rng.random(5)
+    observations, paid = rng.standard_normal((6, 4)).astype(np.float32), 3 * rng.random(5)
+    sums = [sum(0.99 ** (t - i) * paid[i] for i in range(t + 1)) for t in range(5)]
+    rewards = paid / np.std(sums) if scaled else paid
     values = Twin(ppo.critics[kind])(observations)[:, 0].detach().numpy()
     worth = 0.0 if terminated else values[5]
     assert abs(values[5]) > 0.05
-    found, returns = ppo.advantages_and_returns(kind, observations, rewards, terminated)
+    found, returns = ppo.advantages_and_returns(kind, observations, paid, terminated)
     # Backwards, the λ-return is r + γ ((1 − λ) V(s') + λ the next λ-return).
     following = worth
     for t in range(4, -1, -1):
@@ -119,6 +125,52 @@ def test_truncation_bootstraps_and_termination_never(make_ppo, kind, gae_lambda,
         following = rewards[t] + 0.99 * ((1 - gae_lambda) * bootstrap + gae_lambda * following)
         assert returns[t] == pytest.approx(following, abs=1e-5)
         assert found[t] == pytest.approx(following - values[t], abs=1e-5)
+
+
+def silenced(ppo: PPO) -> PPO:
+    """With critics that say 0, so that with λ = 1 advantages are discounted sums."""
+    for critic in ppo.critics.values():
+        critic.network.parameters[:] = 0
+    return ppo
+
+
+def test_advantages_without_scales_are_the_plain_ones(make_ppo):
+    """γ = ½, λ = 1: 8; 4 + ½ 8 = 8; 2 + ½ 8 = 6; whatever came before."""
+    plain = {"scale_rewards": False, "scale_advantages": False, "gae_lambda": 1.0, "discount": 0.5}
+    ppo = silenced(make_ppo(intrinsic=True, **plain))
+    for kind in ("extrinsic", "intrinsic"):
+        for unit in (1, 1000, 0.001):
+            rewards = unit * np.array([2.0, 4.0, 8.0])
+            advantages, returns = ppo.advantages_and_returns(kind, np.zeros((4, 4)), rewards, True)
+            assert advantages.tolist() == returns.tolist() == [6 * unit, 8 * unit, 8 * unit]
+            assert ppo.advantage_scale(kind) == 1.0
+
+
+def test_scales_of_several_episodes_by_hand(make_ppo):
+    """γ = 0, so that a step's discounted sum and advantage are its reward."""
+    ppo = silenced(make_ppo(intrinsic=True, discount=0.0))
+    # The rewards' deviation so far; of all advantages so far, each over its own, the mean square.
+    for rewards, deviation, square in (
+        ([4.0, -4.0], 4.0, 1.0),  # ±1
+        ([0.0, 0.0], math.sqrt(8), 0.5),  # 0
+        ([8.0, -8.0], math.sqrt(160 / 6), (1 + 1 + 2 * 64 * 6 / 160) / 6),
+    ):
+        for kind in ("extrinsic", "intrinsic"):
+            found, _ = ppo.advantages_and_returns(kind, np.zeros((3, 4)), np.array(rewards), True)
+            np.testing.assert_allclose(found, np.array(rewards) / deviation)
+            assert ppo.advantage_scale(kind) == pytest.approx(math.sqrt(square))
+
+
+def test_tiny_costs_are_not_blown_up(make_ppo):
+    """Extrinsic rewards are over at least 1, their advantages over at least 0.1."""
+    ppo, rewards = silenced(make_ppo(intrinsic=True, discount=0.0)), np.array([-0.003, 0.001])
+    extrinsic, intrinsic = (
+        ppo.advantages_and_returns(kind, np.zeros((3, 4)), rewards, True)[0]
+        / ppo.advantage_scale(kind)
+        for kind in ("extrinsic", "intrinsic")
+    )
+    np.testing.assert_allclose(extrinsic, [-0.03, 0.01])
+    np.testing.assert_allclose(intrinsic, np.array([-3, 1]) / math.sqrt(5))
 
 
 # --- Normalisation ------------------------------------------------------------------------------
@@ -135,7 +187,7 @@ def test_observations_are_standardised_by_everything_seen_and_clipped(make_ppo):
     found = ppo.normalise(observations)
     assert found.dtype == np.float32 and np.abs(found[-1]).max() == 10
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-    assert make_ppo().normalise(observations) is observations
+    assert make_ppo(normalise_observations=False).normalise(observations) is observations
 
 
 def test_a_dimension_that_never_varied_is_only_centred(make_ppo):
@@ -179,7 +231,7 @@ def test_gradients_are_means_over_all_steps_of_a_large_batch(make_ppo, monkeypat
     batch = random_batch(ppo, count=20)
     for gradient in (
         lambda part: ppo.actor_gradient(part)[0],
-        lambda part: ppo.critic_gradient("extrinsic", part),
+        ppo.critics["extrinsic"].gradient,
     ):
         expected = np.mean([gradient(batch[t : t + 1]) for t in range(20)], axis=0)
         for block in (1, 7, 20, 512):
@@ -240,38 +292,58 @@ def test_adam_equals_torch_s_with_clipping(max_gradient_norm):
     np.testing.assert_allclose(parameters, expected.detach().numpy(), atol=2e-5)
 
 
+def test_a_preconditioned_direction_by_hand():
+    """Over √v̂ + 10⁻⁵; v̂ after gradients 2 and 1: (0.999 · 0.001 · 4 + 0.001 · 1) / 0.001999."""
+    adam, direction = Adam(np.float32([1, 1]), 0.1), np.float32([6, -6])
+    assert (adam.preconditioned(direction) == direction).all()  # nothing is known yet
+    adam.step(np.float32([0, 2]))
+    np.testing.assert_allclose(adam.preconditioned(direction), [6e5, -3], rtol=1e-4)
+    adam.step(np.float32([0, 1]))
+    state = copy.deepcopy(adam.state_dict())
+    found = adam.preconditioned(direction)
+    np.testing.assert_allclose(found, [6e5, -6 / math.sqrt(0.004996 / 0.001999)], rtol=1e-4)
+    assert found.dtype == np.float32
+    torch.testing.assert_close(adam.state_dict(), state, rtol=0, atol=0)  # asking is not stepping
+
+
 @both_engines
 @both_environments
-@pytest.mark.parametrize("minibatch_size", [None, 16])
-def test_update_equals_a_reference_loop(make_ppo, environment, minibatch_size, engine):
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"minibatch_size": None, "entropy_coefficient": 0.05, "max_gradient_norm": 0.3}],
+    ids=["defaults", "one batch"],
+)
+def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
     """Epochs, minibatches and losses written out in float64 over autograd, with torch's Adam."""
-    settings = {"minibatch_size": minibatch_size, "max_gradient_norm": 0.3}
-    ppo = make_ppo(environment, seed=5, intrinsic=True, engine=engine, **settings)
-    batch = random_batch(ppo, spread=0.05)
+    defaults = {"minibatch_size": 128, "entropy_coefficient": 0.0, "max_gradient_norm": 0.5}
+    minibatch_size, entropy_coefficient, max_gradient_norm = (defaults | changes).values()
+    ppo = make_ppo(environment, seed=5, intrinsic=True, engine=engine, **changes)
+    batch = random_batch(ppo, count=300, spread=0.05)
     twins = {"actor": Twin(ppo.policy)} | {k: Twin(critic) for k, critic in ppo.critics.items()}
     rates = {"actor": 3e-4, "extrinsic": 1e-3, "intrinsic": 1e-3}
     optimisers = {
         name: torch.optim.Adam(twin.parameters(), lr=rates[name], eps=1e-5)
         for name, twin in twins.items()
     }
-    order, size = Streams(5)["minibatches"], minibatch_size or 40
+    order, size = Streams(5)["minibatches"], minibatch_size or 300
     for _ in range(4):
-        places = order.permutation(40) if minibatch_size else np.arange(40)
+        places = order.permutation(300) if minibatch_size else np.arange(300)
         told, norms = np.zeros(3), {}  # of the last epoch, and of its last minibatch
-        for part in (batch[places[start : start + size]] for start in range(0, 40, size)):
+        for part in (batch[places[start : start + size]] for start in range(0, 300, size)):
             policy = twins["actor"].policy(part.observations)
             mean, ratio = surrogate(policy, part)
-            losses = {"actor": -mean - 0.01 * policy.entropy().mean()}
+            losses = {"actor": -mean - entropy_coefficient * policy.entropy().mean()}
             for kind, returns in part.returns.items():
                 errors = twins[kind](part.observations)[:, 0] - torch.from_numpy(returns)
                 losses[kind] = (errors**2).mean()
             clipped = ((ratio - 1).abs() > 0.2).double()
             sums = (ratio - 1 - ratio.log()).sum(), clipped.sum(), policy.entropy().sum()
-            told += [value.item() / 40 for value in sums]
+            told += [value.item() / 300 for value in sums]
             for name, loss in losses.items():
                 optimisers[name].zero_grad()
                 loss.backward()
-                norm = torch.nn.utils.clip_grad_norm_(twins[name].parameters(), 0.3)
+                parameters = twins[name].parameters()
+                norm = torch.nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
                 norms[name] = norm.item()
                 optimisers[name].step()
     before = {name: adam.parameters.copy() for name, adam in ppo.optimisers.items()}
@@ -304,9 +376,17 @@ def test_restored_ppo_continues_to_the_bit(make_ppo):
     batch = random_batch(original)
     original.normaliser.update(batch.observations)
     original.update(batch)
+    rewards = 5 + batch.advantages.astype(np.float64)
+    for kind in original.critics:
+        original.advantages_and_returns(kind, batch.observations[:21], rewards[:20], True)
     state = copy.deepcopy(original.state_dict())
     restored = make_ppo(seed=1, intrinsic=True, minibatch_size=8, normalise_observations=True)
     restored.load_state_dict(state)
+    for kind in original.critics:
+        episode = kind, batch.observations[20:], 3 * rewards[21:], True
+        found = [ppo.advantages_and_returns(*episode) for ppo in (original, restored)]
+        np.testing.assert_equal(*found)
+        assert original.advantage_scale(kind) == restored.advantage_scale(kind)
     assert original.update(batch) == restored.update(batch)
     for name, adam in original.optimisers.items():
         assert (adam.parameters == restored.optimisers[name].parameters).all()

@@ -1,6 +1,6 @@
 """Statistics against hand calculations, exhaustive enumeration and scipy."""
 
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -101,7 +101,7 @@ def test_paired_comparison_at_its_limits():
 
 def test_probability_of_improvement_against_a_loop_and_scipy():
     probability, low, high = s.probability_of_improvement(
-        FIVE, OTHER[:4], 0.95, REPETITIONS, generator()
+        [(FIVE, OTHER[:4])], 0.95, REPETITIONS, generator()
     )
     wins = [(x > y) + 0.5 * (x == y) for x in FIVE for y in OTHER[:4]]
     assert probability == sum(wins) / 20
@@ -115,10 +115,22 @@ def test_probability_of_improvement_against_a_loop_and_scipy():
     np.testing.assert_allclose((low, high), np.percentile(resampled, [2.5, 97.5]), atol=0.051)
 
 
+def test_probability_of_improvement_over_several_environments():
+    pairs = [(FIVE, OTHER), (TWELVE[:4], TWELVE[4:])]
+    alone = [s.probability_of_improvement([p], 0.95, REPETITIONS, generator()) for p in pairs]
+    probability, low, high = s.probability_of_improvement(pairs, 0.95, REPETITIONS, generator())
+    assert probability == pytest.approx(np.mean([one[0] for one in alone]))
+    draws, resampled = generator(7), []
+    for _ in range(REPETITIONS):  # stratified: every environment's runs among themselves
+        drawn = [(draws.choice(x, len(x)), draws.choice(y, len(y))) for x, y in pairs]
+        resampled.append(np.mean([np.heaviside(np.subtract.outer(*d), 0.5).mean() for d in drawn]))
+    np.testing.assert_allclose((low, high), np.percentile(resampled, [2.5, 97.5]), atol=0.02)
+
+
 def test_probability_of_improvement_at_its_limits():
     def probability(x, y):
         return s.probability_of_improvement(
-            np.array(x, float), np.array(y, float), 0.95, REPETITIONS, generator()
+            [(np.array(x, float), np.array(y, float))], 0.95, REPETITIONS, generator()
         )
 
     assert probability([2, 3], [0, 1]) == (1, 1, 1)
@@ -141,3 +153,59 @@ def test_holm_by_hand():
 def test_holm_refuses_what_is_no_p_value(p):
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
         s.holm(p)
+
+
+NEVER = np.inf
+
+
+def observed_minus_expected(x, y):
+    """The log-rank statistic of x, event by event."""
+    everything, result = [*x, *y], 0.0
+    for time in sorted({time for time in everything if time < NEVER}):
+        at_risk = sum(t >= time for t in everything)
+        expected = everything.count(time) * sum(t >= time for t in x) / at_risk
+        result += list(x).count(time) - expected
+    return result
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        ([1, 2, 3], [4, 5, 6]),
+        ([186, 201, NEVER, 140], [201, NEVER, NEVER]),
+        ([10, 10, 20, NEVER], [10, 30, 30, NEVER, NEVER]),
+        ([5, 40, NEVER], [10, 20, 20, 30, 50, NEVER, NEVER]),
+        ([60, 70], [10, 20, 30, 40, 60, NEVER]),
+    ],
+)
+def test_logrank_against_enumeration(x, y):
+    n, everything = len(x), [*x, *y]
+    outcomes = []
+    for chosen in combinations(range(len(everything)), n):
+        rest = [t for place, t in enumerate(everything) if place not in chosen]
+        outcomes.append(observed_minus_expected([everything[place] for place in chosen], rest))
+    outcomes, found = np.array(outcomes), observed_minus_expected(x, y)
+    tails = np.mean(outcomes >= found - 1e-9), np.mean(outcomes <= found + 1e-9)
+    expected = min(1, 2 * min(tails))
+    assert s.logrank(np.array(x, float), np.array(y, float), 9999, generator()) == pytest.approx(
+        expected
+    )
+
+
+def test_logrank_of_many_runs_is_near_scipys_approximation():
+    draws = generator(8)
+    for shift in (0, 40, 80):
+        x, y = draws.exponential(100, 40), shift + draws.exponential(100, 40)
+        seen = [np.where(values < 200, values, NEVER) for values in (x, y)]
+        censored = [
+            scipy.stats.CensoredData.right_censored(np.minimum(v, 200), v == NEVER) for v in seen
+        ]
+        expected = scipy.stats.logrank(*censored).pvalue
+        assert s.logrank(*seen, 9999, generator()) == pytest.approx(expected, abs=0.02)
+
+
+def test_logrank_at_its_limits():
+    same = np.array([100.0, NEVER])
+    assert s.logrank(np.full(3, NEVER), np.full(3, NEVER), 999, generator()) == 1
+    assert s.logrank(same, same, 999, generator()) == 1
+    assert np.isnan(s.logrank(same[:1], same[1:], 999, generator()))

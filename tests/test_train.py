@@ -19,6 +19,7 @@ from mace_rl.train import Trainer
 
 ENVIRONMENTS = {"CartPole-v1": 25, "Acrobot-v1": 12, "HopperBulletEnv-v0": 20}  # episodes
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}
+AS_THEY_ARE = dict.fromkeys(("normalise_observations", "scale_rewards", "scale_advantages"), False)
 # One update per episode as in the paper's runs; several episodes with minibatches; in torch.
 SETTINGS = {
     "an episode": {},
@@ -60,7 +61,7 @@ def parts(item: Experience, name: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, settings):
     """Though memory, novelty, the intrinsic critic and the meta network are all at work."""
-    changes = {"episodes": ENVIRONMENTS[environment]} | SETTINGS[settings]
+    changes = {"episodes": ENVIRONMENTS[environment], "meta": {"horizon": 1}} | SETTINGS[settings]
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
     fixed = finish(run_config(environment, "mace_fixed", 3, beta=zero, **changes))
@@ -158,7 +159,7 @@ def test_both_engines_begin_alike(run_config, environment, variant):
     [
         ("FrozenLake-v1", {}),  # Discrete observations
         ("Pendulum-v1", {}),  # Box actions
-        ("Pendulum-v1", {"ppo": {"rollout_steps": 500, "normalise_observations": True}}),
+        ("Pendulum-v1", {"ppo": {"rollout_steps": 500} | AS_THEY_ARE}),
         ("MountainCar-v0", {"meta": {"max_sequence": None}}),
         ("Taxi-v4", {}),
     ],
@@ -183,6 +184,7 @@ def test_any_environment_trains(run_config, environment, variant, changes):
 def test_it_learns_what_pays(run_config, register, variant, network):
     name = register("Bonanza-v0", Bonanza, 5)
     settings = {"actor_learning_rate": 0.01, "rollout_steps": 50, "network": network}
+    settings["centre_advantages"] = True  # its states do not tell how many steps are left
     config = run_config(name, variant, 0, episodes=200, ppo=settings)
     returns = [record.extrinsic_return for record in finish(config).records]
     assert np.mean(returns[:10]) < 3.5 and np.mean(returns[-50:]) > 4.5
@@ -198,7 +200,8 @@ def test_meta_network_learns_and_beta_moves(run_config, monkeypatch):
     step = adam.step
     monkeypatch.setattr(adam, "step", lambda gradient: norms.append(step(gradient)))
     finish(trainer)
-    assert len(norms) == 58  # the first β is given; the effect of the last is never seen
+    # The first β is given, and each is judged by the 10 updates that follow: those of 2 to 50.
+    assert len(norms) == 49
     assert all(0 < norm < np.inf for norm in norms)
     for before, after in zip(*map(network.split, (initial, network.parameters)), strict=True):
         assert (before != after).any() and np.isfinite(after).all()
@@ -237,9 +240,15 @@ def test_rollout_that_is_exactly_full_ends(run_config, register):
     assert [len(records) for records in Trainer(config).run()] == [2, 2, 2, 1]
 
 
-def test_each_reward_has_its_own_returns_and_critic(run_config):
-    """With λ = 1 and an episode that terminates: the discounted sums, minus each critic's value."""
-    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=3))
+@pytest.mark.parametrize("scaled", [True, False])
+def test_each_reward_has_its_own_returns_and_critic(run_config, scaled):
+    """With λ = 1 and an episode that terminates: the discounted sums, minus each critic's value.
+
+    Over the reward's scale, but as they were paid in memory.
+    """
+    settings = {"gae_lambda": 1.0, "scale_rewards": scaled}
+    changes = {"episodes": 3, "ppo": settings, "memory": {"write_every": 1}}
+    trainer, remembered = Trainer(run_config("CartPole-v1", "mace_full", 0, **changes)), []
     for _ in range(3):
         critics = {kind: Twin(critic) for kind, critic in trainer.ppo.critics.items()}
         (item,) = rollout = trainer.collect()
@@ -247,37 +256,54 @@ def test_each_reward_has_its_own_returns_and_critic(run_config):
         both = {"extrinsic": item.episode.rewards, "intrinsic": item.bonus.reward}
         for kind, rewards in both.items():
             length = len(rewards)
-            returns = [
-                sum(0.99 ** (i - t) * rewards[i] for i in range(t, length)) for t in range(length)
-            ]
+            returns = np.array(
+                [sum(0.99 ** (i - t) * rewards[i] for i in range(t, length)) for t in range(length)]
+            )
+            remembered += returns.tolist() if kind == "extrinsic" else []
+            scale = trainer.ppo.reward_scales[kind].value if scaled else 1.0
+            assert (abs(scale - 1) > 0.1) == scaled
             values = critics[kind](item.observations[:-1])[:, 0].detach().numpy()
             found = getattr(item, f"{kind}_returns"), getattr(item, f"{kind}_advantages")
-            np.testing.assert_allclose(found[0], returns, rtol=1e-5)
-            np.testing.assert_allclose(found[1], returns - values, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(found[0], returns / scale, rtol=1e-5)
+            np.testing.assert_allclose(found[1], returns / scale - values, rtol=1e-4, atol=1e-5)
         trainer.improve(rollout)
+    memory = trainer.curiosity.memory
+    np.testing.assert_allclose(memory.values[: len(memory), -1], remembered, rtol=1e-5)
     assert np.ptp(item.bonus.reward) > 0
 
 
+@pytest.mark.parametrize(("scaled", "centred"), [(True, True), (True, False), (False, True)])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant):
-    """The batch that PPO gets, from the episodes by hand, with the episodes' own β."""
-    settings = {"rollout_steps": 60, "gae_lambda": 0.9}
+def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant, scaled, centred):
+    """The batch that PPO gets, from the episodes by hand, with the episodes' own β.
+
+    Each part over its root mean square in all episodes so far, and the sum normalised.
+    """
+    settings = {"rollout_steps": 60, "gae_lambda": 0.9, "scale_advantages": scaled}
+    settings["centre_advantages"] = centred
     trainer = Trainer(run_config("CartPole-v1", variant, 0, episodes=9, ppo=settings))
     batches, update, rollouts = [], trainer.ppo.update, rollouts_of(trainer, monkeypatch)
     monkeypatch.setattr(trainer.ppo, "update", lambda b: (batches.append(b), update(b))[1])
     finish(trainer)
     assert max(map(len, rollouts)) > 1
+    seen: tuple[list, list] = [], []
     for batch, rollout in zip(batches, rollouts, strict=True):
-        total = [
-            extrinsic + item.beta * intrinsic
-            for item in rollout
-            for extrinsic, intrinsic in zip(*parts(item, "advantages"), strict=True)
-        ]
-        expected = (np.array(total) - np.mean(total)) / np.std(total)
+        total = []
+        for item in rollout:
+            scales = []
+            for advantages, before in zip(parts(item, "advantages"), seen, strict=True):
+                before += advantages.tolist()
+                scales.append(math.sqrt(np.mean(np.square(before))) if scaled else 1.0)
+            extrinsic, intrinsic = parts(item, "advantages")
+            total += (extrinsic / scales[0]).tolist()
+            if variant != "ppo":
+                total[-len(item.episode) :] += item.beta * intrinsic / scales[1]
+        deviations = np.array(total) - (np.mean(total) if centred else 0)
+        expected = deviations / math.sqrt(np.mean(np.square(deviations)))
         np.testing.assert_allclose(batch.advantages, expected, rtol=1e-4, atol=1e-5)
         played = [item.episode for item in rollout]
         assert (batch.actions == [a for one in played for a in one.actions]).all()
-        assert (batch.observations == [o for one in played for o in one.observations[:-1]]).all()
+        assert (batch.observations == [o for one in rollout for o in one.observations[:-1]]).all()
         assert (batch.log_probs == [p for one in played for p in one.log_probs]).all()
         kinds = ["extrinsic"] if variant == "ppo" else ["extrinsic", "intrinsic"]
         assert list(batch.returns) == kinds
@@ -328,7 +354,8 @@ def test_normaliser_of_the_update_is_that_of_acting(run_config):
 def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment, variant):
     """Every number of every row another way: two epochs over whole rollouts of some episodes."""
     settings = {"rollout_steps": 400 if environment == "Pendulum-v1" else 60, "epochs": 2}
-    config = run_config(environment, variant, 1, episodes=9, ppo=settings)
+    changes = {"ppo": settings | {"minibatch_size": None}, "meta": {"horizon": 1}}
+    config = run_config(environment, variant, 1, episodes=9, **changes)
     trainer = Trainer(config)
     rollouts, policies, norms, critics = rollouts_of(trainer, monkeypatch), [], {}, []
     for name, adam in trainer.ppo.optimisers.items():
@@ -360,9 +387,12 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
             "entropy": policy.entropy().mean().item(),
             "beta": np.mean([item.beta for item in rollout]),
         }
-        weighted = np.concatenate([item.beta * parts(item, "advantages")[1] for item in rollout])
-        own = np.var(np.concatenate([parts(item, "advantages")[0] for item in rollout]))
-        expected["bonus_share"] = np.var(weighted) / (own + np.var(weighted))
+        own, weighted = [], []
+        for item in rollout:
+            extrinsic, intrinsic = parts(item, "advantages")
+            own.extend(extrinsic / item.extrinsic_scale)
+            weighted.extend(item.beta * intrinsic / item.intrinsic_scale)
+        expected["bonus_share"] = np.var(weighted) / (np.var(own) + np.var(weighted))
         expected |= {f"gradient_norm_{name}": norms[name][at + 1] for name in norms}
         for kind, critic in critics[at].items():
             returns = np.concatenate([getattr(item, f"{kind}_returns") for item in rollout])
@@ -422,7 +452,8 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, network, place, valu
     [("density", "episode 1: a log-density is nan"), ("meta", "episode 2: β is nan")],
 )
 def test_other_bad_weights_stop_the_run(run_config, part, message, place):
-    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9))
+    novelty = {"write_every": 1, "neighbours": [1]}  # enough states in the first episode
+    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9, novelty=novelty))
     owner = trainer.curiosity.novelty.density if part == "density" else trainer.controller
     owner.network.parameters[place] = np.nan
     with pytest.raises(NonFiniteError, match=f"CartPole-v1 mace_full seed 0, {message}"):

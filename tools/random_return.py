@@ -9,6 +9,8 @@ import gymnasium
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
+import mace_rl.environments  # noqa: F401  (registers our own)
+
 
 def random_returns(name: str, episodes: int) -> np.ndarray:
     """Undiscounted return of each episode, [episodes], with seed 0."""
@@ -31,4 +33,4 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     measured = random_returns(sys.argv[1], int(sys.argv[2]))
     error = measured.std(ddof=1) / np.sqrt(len(measured))
-    print(f"{sys.argv[1]}: {measured.mean():.2f} (standard error {error:.2f})")
+    print(f"{sys.argv[1]}: {measured.mean():.4g} (standard error {error:.2g})")

@@ -7,7 +7,7 @@ import numpy as np
 
 from mace_rl.agent.advantages import variance
 from mace_rl.agent.ppo import Update
-from mace_rl.experience import Experience
+from mace_rl.experience import Experience, extrinsic_part, intrinsic_part
 from mace_rl.results.records import UpdateRecord
 
 
@@ -30,12 +30,14 @@ def diagnose(
         return 1 - left / spread if spread > 0 else math.nan
 
     def mean_of(part: str) -> float:
+        if getattr(rollout[0].bonus, part) is None:  # a bonus that has no such part
+            return math.nan
         values = stacked(getattr(item.bonus, part) for item in rollout)
         return float(values.sum() / len(values))
 
     has_bonus = rollout[0].bonus is not None
-    extrinsic = variance(stacked(item.extrinsic_advantages for item in rollout))
-    weighted = variance(stacked(item.beta * item.intrinsic_advantages for item in rollout))
+    extrinsic = variance(stacked(extrinsic_part(item) for item in rollout))
+    weighted = variance(stacked(item.beta * intrinsic_part(item) for item in rollout))
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mace_rl.bonus.curiosity import Bonus
+from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.environments.rollout import Episode
 
 
@@ -20,6 +20,8 @@ class Experience:
     extrinsic_returns: np.ndarray
     intrinsic_advantages: np.ndarray  # zeros without a bonus, like the next
     intrinsic_returns: np.ndarray
+    extrinsic_scale: float  # what the advantages are divided by where they are added up; or 1
+    intrinsic_scale: float
 
 
 def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
@@ -33,10 +35,20 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(pieces).astype(np.float32)
 
 
+def extrinsic_part(item: Experience) -> np.ndarray:
+    """What the total advantage has of the extrinsic one, [T]: it, or in units of its scale."""
+    return item.extrinsic_advantages / item.extrinsic_scale
+
+
+def intrinsic_part(item: Experience) -> np.ndarray:
+    """What β weighs in the total advantage, [T]: the intrinsic one, or in units of its scale."""
+    return item.intrinsic_advantages / item.intrinsic_scale
+
+
 def total_advantages(rollout: list[Experience]) -> np.ndarray:
     """A_E + β A_I of every step, float64 [N]."""
     return np.concatenate(
-        [item.extrinsic_advantages + item.beta * item.intrinsic_advantages for item in rollout]
+        [extrinsic_part(item) + item.beta * intrinsic_part(item) for item in rollout]
     )
 
 
@@ -45,6 +57,6 @@ def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
     parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
     start = 0
     for part, item in zip(parts, rollout, strict=True):
-        part[start : start + len(item.episode)] = item.intrinsic_advantages
+        part[start : start + len(item.episode)] = intrinsic_part(item)
         start += len(item.episode)
     return list(parts)

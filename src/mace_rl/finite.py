@@ -15,10 +15,15 @@ def require_finite(name: str, values: float | np.ndarray, where: str = "") -> No
         raise NonFiniteError(f"{name} is {bad}{where}")
 
 
-def require_share(name: str, values: float | np.ndarray, rounding: float = 0.0) -> None:
-    """Raise `NonFiniteError` unless all `values` are in [0, 1], up to so much `rounding`."""
+def require_share(
+    name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
+) -> None:
+    """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`].
+
+    They may be outside by so much `rounding`.
+    """
     require_finite(name, values)
     found = np.asarray(values)
-    outside = found[(found < -rounding) | (found > 1 + rounding)].ravel()
+    outside = found[(found < -rounding) | (found > largest + rounding)].ravel()
     if len(outside):
-        raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, 1]")
+        raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, {largest:g}]")

@@ -19,6 +19,7 @@ STREAMS = (
     "meta",
     "novelty",
     "beta",
+    "bonus",
 )
 
 

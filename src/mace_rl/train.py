@@ -16,20 +16,50 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 
-from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.advantages import normalised, normalised_change, root_mean_square
+from mace_rl.agent.dictionary_critic import DictionaryCritic
 from mace_rl.agent.network import Network, network
+from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import PPO, Batch, Update
-from mace_rl.beta.controller import BetaController
+from mace_rl.agent.ppo import PPO, Batch, Critic, NetworkCritic, Update
+from mace_rl.beta.controller import BetaController, Effect
+from mace_rl.beta.controls import RandomDraw, SlidingWindowBandit
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.schedule import ExponentialSchedule
+from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.bonus.hashing import HashCounts
+from mace_rl.bonus.icm import IntrinsicCuriosityModule
+from mace_rl.bonus.intrinsic import IntrinsicReward
+from mace_rl.bonus.rnd import RandomNetworkDistillation
 from mace_rl.config.plugins import make
-from mace_rl.config.run import CustomBeta, ExponentialBeta, MetaBeta, NoBonus, RunConfig
+from mace_rl.config.run import (
+    BanditBeta,
+    ConstantBeta,
+    CuriosityBonus,
+    CustomBeta,
+    CustomBonus,
+    DictionaryValue,
+    ExponentialBeta,
+    HashCountsBonus,
+    ICMBonus,
+    MetaBeta,
+    NoBonus,
+    RandomBeta,
+    RNDBonus,
+    RunConfig,
+)
 from mace_rl.diagnostics import diagnose
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import Experience, intrinsic_parts, joined, steps, total_advantages
+from mace_rl.experience import (
+    Experience,
+    extrinsic_part,
+    intrinsic_part,
+    intrinsic_parts,
+    joined,
+    steps,
+    total_advantages,
+)
 from mace_rl.finite import NonFiniteError, require_finite, require_share
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows
 from mace_rl.streams import Streams
@@ -48,7 +78,7 @@ class Trainer:
             config.environment_arguments,
         )
         self.controller = beta_controller(config, self.environment, streams)
-        self.curiosity = curiosity(config, self.environment, streams) if self.controller else None
+        self.curiosity = intrinsic_reward(config, self.environment, streams)
         self.ppo = ppo(config, self.environment, self.curiosity is not None, streams)
         self.rollout = rollout_for(self.environment, self.ppo.acting_policy())
         self.noise = streams["actions"]
@@ -106,11 +136,12 @@ class Trainer:
             require_share("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
-            require_share("the curiosity bonus", reward, rounding=1e-6)
+            require_share("the curiosity bonus", reward, 1e-6, self.curiosity.largest)
             intrinsic = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
             )
-            self.curiosity.remember(episode, extrinsic[1])
+            unit = self.ppo.reward_scales["extrinsic"].value if self.config.ppo.scale_rewards else 1
+            self.curiosity.remember(episode, extrinsic[1] * unit)
             self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
@@ -124,40 +155,45 @@ class Trainer:
                 terminated=int(episode.terminated),
             )
         )
-        return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic)
+        scales = self.ppo.advantage_scale("extrinsic"), 1.0
+        if self.curiosity:
+            scales = scales[0], self.ppo.advantage_scale("intrinsic")
+        return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic, *scales)
 
     def adapt(self, rollout: list[Experience]) -> float | None:
         """Meta-adaptation: tell the controller what each β changes in the update, before it.
 
-        The update starts along the policy gradient of the normalised total advantage. Shown are its
-        derivative with respect to each episode's β, relative to its length, and the policy gradient
-        of the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
+        The update steps along the policy gradient g of the normalised total advantage, as Adam
+        preconditions it. Shown are dg/dβ of each episode, preconditioned alike, and g_E, that of
+        the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
         """
         if not (self.controller and self.controller.learns):
             return None
-        extrinsic = np.concatenate([item.extrinsic_advantages for item in rollout])
+        centred = self.config.ppo.centre_advantages
+        extrinsic = np.concatenate([extrinsic_part(item) for item in rollout])
+        if centred:
+            extrinsic -= extrinsic.mean()
         total = total_advantages(rollout)
-        extrinsic_gradient, update, *changes = self.ppo.policy_gradients(
-            *steps(rollout),
-            [
-                extrinsic - extrinsic.mean(),
-                normalised(total),
-                *(normalised_change(total, change) for change in intrinsic_parts(rollout)),
-            ],
-        )
-        length = max(float(np.linalg.norm(update)), 1e-8)
-        return self.controller.learn(extrinsic_gradient, [change / length for change in changes])
+        changes = [normalised_change(total, part, centred) for part in intrinsic_parts(rollout)]
+        gradient, *changes = self.ppo.policy_gradients(*steps(rollout), [extrinsic, *changes])
+        adam = self.ppo.optimisers["actor"]
+        effects = [
+            Effect(adam.preconditioned(change), root_mean_square(intrinsic_part(item)))
+            for change, item in zip(changes, rollout, strict=True)
+        ]
+        return self.controller.learn(gradient, root_mean_square(extrinsic), effects)
 
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
         if self.curiosity:
             returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
+        advantages = normalised(total_advantages(rollout), self.config.ppo.centre_advantages)
         update = self.ppo.update(
             Batch(
                 *steps(rollout),
                 log_probs=joined([item.episode.log_probs for item in rollout]),
-                advantages=normalised(total_advantages(rollout)).astype(np.float32),
+                advantages=advantages.astype(np.float32),
                 returns=returns,
             )
         )
@@ -206,6 +242,12 @@ def beta_controller(
     match config.beta:
         case NoBonus():
             return None
+        case ConstantBeta():
+            return Constant(config.beta)
+        case RandomBeta():
+            return RandomDraw(config.beta, streams["beta"])
+        case BanditBeta():
+            return SlidingWindowBandit(config.beta, config.ppo.rollout_steps, streams["beta"])
         case ExponentialBeta():
             return ExponentialSchedule(config.beta)
         case MetaBeta(initial=initial):
@@ -216,10 +258,25 @@ def beta_controller(
             return make(rule, "beta.rule", streams["beta"], **arguments)
 
 
-def curiosity(config: RunConfig, environment: Environment, streams: Streams) -> Curiosity:
-    """The curiosity bonus with its memory and novelty."""
+def intrinsic_reward(
+    config: RunConfig, environment: Environment, streams: Streams
+) -> IntrinsicReward | None:
+    """What β weighs: the curiosity bonus with its memory and novelty, or another; None in PPO."""
     space, size = environment.observation_space, environment.observation_size
-    return Curiosity(config.memory, config.novelty, config.engine, space, size, streams)
+    actions, generator = environment.action_space, streams["bonus"]
+    match config.bonus:
+        case None:
+            return None
+        case CuriosityBonus():
+            return Curiosity(config.memory, config.novelty, config.engine, space, size, streams)
+        case ICMBonus():
+            return IntrinsicCuriosityModule(config.bonus, space, actions, size, generator)
+        case RNDBonus():
+            return RandomNetworkDistillation(config.bonus, config.engine, space, size, generator)
+        case HashCountsBonus():
+            return HashCounts(config.bonus, space, size, generator)
+        case CustomBonus(estimator=estimator, arguments=arguments):
+            return make(estimator, "bonus.estimator", size, actions, generator, **arguments)
 
 
 def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:
@@ -233,5 +290,14 @@ def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: S
     # A small last layer starts near the uniform policy, or at means near 0.
     policy = Policy(new(actions, 0.01, "actor"), space, config.ppo.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
-    critics = {kind: new(1, 1.0, f"{kind}_critic") for kind in kinds}
-    return PPO(config.ppo, policy, critics, size, streams["minibatches"])
+    normaliser = RunningNormaliser(size)
+
+    def critic(kind: str) -> Critic:
+        settings = config.ppo.critic
+        if isinstance(settings, DictionaryValue):
+            normalised = config.ppo.normalise_observations
+            return DictionaryCritic(kind, settings, normaliser, normalised)
+        return NetworkCritic(kind, new(1, 1.0, f"{kind}_critic"), config.ppo)
+
+    critics = {kind: critic(kind) for kind in kinds}
+    return PPO(config.ppo, policy, critics, normaliser, streams["minibatches"])

@@ -3,7 +3,8 @@
 from mace_rl.results.metrics import all_metrics
 
 try:
-    all_metrics(study.metrics)  # the user's own among them: are they metrics?
+    MEASURED = study.metrics.within(study.environments, study.variants)
+    all_metrics(MEASURED)  # the user's own among them: are they metrics?
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {origin}: {error}")
 
@@ -20,7 +21,7 @@ rule metrics:
         environments=study.environments,
         variants=study.variants,
         seeds=study.seeds,
-        settings=study.metrics.model_dump(),
-        code=code("metrics.py", study.metrics),
+        settings=MEASURED.model_dump(),
+        code=code("metrics.py", MEASURED),
     script:
         "../scripts/metrics.py"

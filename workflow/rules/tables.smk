@@ -19,18 +19,31 @@ rule table1:
         environments=study.environments,
         variants=study.variants,
         seeds=study.seeds,
-        settings=study.metrics.model_dump(),
+        settings=MEASURED.model_dump(),
         labels=study.labels,
-        code=code("table1.py", study.metrics),
+        code=code("table1.py", MEASURED),
     script:
         "../scripts/table1.py"
+
+
+# What the learnt β loses against the best constant one: only where the configuration asks for it.
+REGRET = (
+    {
+        "regret": report(
+            f"{RESULTS}/regret.csv", caption="../report/regret.rst", category="Supplement"
+        )
+    }
+    if MEASURED.regret
+    else {}
+)
 
 
 rule comparisons:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        report(
+        **REGRET,
+        comparisons=report(
             f"{RESULTS}/comparisons.csv",
             caption="../report/comparisons.rst",
             category="Supplement",
@@ -41,8 +54,8 @@ rule comparisons:
         environments=study.environments,
         variants=study.variants,
         seeds=study.seeds,
-        settings=study.metrics.model_dump(),
-        code=code("comparisons.py", study.metrics),
+        settings=MEASURED.model_dump(),
+        code=code("comparisons.py", MEASURED),
     script:
         "../scripts/comparisons.py"
 

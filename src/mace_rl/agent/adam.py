@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from numba import njit
 
+DECAY_MEAN, DECAY_SQUARE, EPSILON = 0.9, 0.999, 1e-5  # β₁, β₂ and ε
+
 
 class Adam:
     """Adam on one vector of parameters, changed in place, with the gradient clipped by its norm."""
@@ -36,6 +38,17 @@ class Adam:
         adam(self.parameters, gradient, self.mean, self.square, self.time, self.learning_rate)
         return norm
 
+    def preconditioned(self, direction: np.ndarray) -> np.ndarray:
+        """`direction`, [n], in the units in which this optimiser steps: over √v̂ + ε, float32 [n].
+
+        v̂ is the second moment after the steps so far; before the first one nothing is known of it
+        and the direction is returned.
+        """
+        if self.time == 0:
+            return direction
+        unbiased = self.square / np.float32(1 - DECAY_SQUARE**self.time)
+        return direction / (np.sqrt(unbiased) + np.float32(EPSILON))
+
     def state_dict(self) -> dict[str, Any]:
         """Parameters and the optimiser's moments."""
         arrays = {"parameters": self.parameters, "mean": self.mean, "square": self.square}
@@ -57,12 +70,11 @@ def adam(parameters, gradient, mean, square, time, learning_rate):
 
     mean and square are the moments' running estimates, time counts steps from 1.
     """
-    decay_mean, decay_square, epsilon = 0.9, 0.999, 1e-5
-    rate = np.float32(learning_rate / (1 - decay_mean**time))
-    scale = np.float32(1 / math.sqrt(1 - decay_square**time))
-    keep_mean, keep_square = np.float32(decay_mean), np.float32(decay_square)
-    add_mean, add_square = np.float32(1 - decay_mean), np.float32(1 - decay_square)
+    rate = np.float32(learning_rate / (1 - DECAY_MEAN**time))
+    scale = np.float32(1 / math.sqrt(1 - DECAY_SQUARE**time))
+    keep_mean, keep_square = np.float32(DECAY_MEAN), np.float32(DECAY_SQUARE)
+    add_mean, add_square = np.float32(1 - DECAY_MEAN), np.float32(1 - DECAY_SQUARE)
     for i in range(len(parameters)):
         mean[i] = keep_mean * mean[i] + add_mean * gradient[i]
         square[i] = keep_square * square[i] + add_square * gradient[i] * gradient[i]
-        parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(epsilon))
+        parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(EPSILON))

@@ -23,20 +23,27 @@ def generalised_advantages(rewards, values, discount, gae_lambda):
     return result
 
 
-def normalised(advantages: np.ndarray) -> np.ndarray:
-    """Advantages with mean 0 and standard deviation 1, [N]."""
-    centred = advantages - advantages.mean()
-    return centred / (root_mean_square(centred) + 1e-8)
+def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
+    """Advantages with root mean square 1, [N]; if `centred`, with mean 0 too.
+
+    A rollout is often one episode. To centre it is to forget whether it went better or worse than
+    expected as a whole, and to blow up what is left, which in an episode that went well all the way
+    is noise.
+    """
+    if centred:
+        advantages = advantages - advantages.mean()
+    return advantages / (root_mean_square(advantages) + 1e-8)
 
 
-def normalised_change(advantages: np.ndarray, change: np.ndarray) -> np.ndarray:
+def normalised_change(advantages: np.ndarray, change: np.ndarray, centred: bool) -> np.ndarray:
     """d normalised(advantages + ε · change) / dε at ε = 0, [N].
 
     What of the change is parallel to the advantages is lost in the normalisation.
     """
-    centred, change = advantages - advantages.mean(), change - change.mean()
-    spread = root_mean_square(centred) + 1e-8
-    direction = centred / spread
+    if centred:
+        advantages, change = advantages - advantages.mean(), change - change.mean()
+    spread = root_mean_square(advantages) + 1e-8
+    direction = advantages / spread
     return (change - direction * (direction @ change / len(change))) / spread
 
 

@@ -28,10 +28,13 @@ class RunningNormaliser:
     @property
     def std(self) -> np.ndarray:
         """Standard deviation, [size]; 1 where nothing has varied yet."""
-        if self.count == 0:
-            return np.ones_like(self.mean)
-        std = np.sqrt(self.sum_of_squares / self.count)
-        return np.where(std > 1e-8, std, 1.0)
+        std = np.sqrt(self.sum_of_squares / max(self.count, 1))
+        return np.where(self.varied, std, 1.0)
+
+    @property
+    def varied(self) -> np.ndarray:
+        """Whether each dimension has varied, beyond rounding, bool [size]."""
+        return np.sqrt(self.sum_of_squares / max(self.count, 1)) > 1e-8
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """(observations - mean) / std as float32, [..., size]."""

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from mace_rl.agent import kernels
 from mace_rl.agent.adam import Adam
@@ -12,12 +13,14 @@ from mace_rl.agent.advantages import generalised_advantages
 from mace_rl.agent.network import Network
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import ActingPolicy, Policy
+from mace_rl.agent.scale import AdvantageScale, RewardScale
 from mace_rl.config.run import PPOConfig
 
 # Steps that go through a network at once in an update. Arrays for many more would not fit into the
 # processor's cache, and the system takes back their memory after each use: a quarter more time for
 # 2048 steps.
 BLOCK = 512
+TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 
 
@@ -62,6 +65,73 @@ class Update:
     entropy: float = 0.0  # of the policy, nats
 
 
+class Critic(Protocol):
+    """V(s) for one kind of reward, and how it learns."""
+
+    optimiser: Adam | None  # None: there is nothing that gradients change
+
+    def values(self, observations: np.ndarray) -> np.ndarray:
+        """V of each state, float64 [N]; observations: normalised, float32 [N, observation]."""
+
+    def learn(self, batch: Batch) -> float:
+        """Learn from one minibatch of one epoch; returns the gradient's norm, 0 without one."""
+
+    def remember(self, batch: Batch) -> None:
+        """Take in all steps of an update, once, after its epochs."""
+
+    def module(self) -> torch.nn.Module:
+        """The same values as a torch module, [N, observation] → [N, 1]."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class NetworkCritic:
+    """A network with one output that descends the mean squared error; see `Critic`."""
+
+    def __init__(self, kind: str, network: Network, config: PPOConfig) -> None:
+        self.kind, self.network = kind, network
+        self.optimiser = Adam(
+            network.parameters, config.critic_learning_rate, config.max_gradient_norm
+        )
+
+    def values(self, observations: np.ndarray) -> np.ndarray:
+        """See `Critic`."""
+        return self.network.forward(observations).outputs[:, 0].astype(np.float64)
+
+    def learn(self, batch: Batch) -> float:
+        """See `Critic`."""
+        return self.optimiser.step(self.gradient(batch))
+
+    def gradient(self, batch: Batch) -> np.ndarray:
+        """Gradient of the mean squared error of V(s) against the λ-returns, float32 [n]."""
+        total: np.ndarray | None = None
+        for steps in batch.blocks():
+            trace = self.network.forward(steps.observations)
+            errors = trace.outputs - steps.returns[self.kind][:, None]
+            gradient = self.network.backward(trace, 2 * errors)
+            total = gradient if total is None else total + gradient
+        return total / np.float32(len(batch))
+
+    def remember(self, batch: Batch) -> None:
+        """See `Critic`: everything is learnt in the epochs."""
+
+    def module(self) -> torch.nn.Module:
+        """See `Critic`."""
+        return self.network.module()
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Critic`."""
+        return self.optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `Critic`."""
+        self.optimiser.load_state_dict(state)
+
+
 class PPO:
     """Policy and critics with their optimisers, and the update.
 
@@ -74,21 +144,28 @@ class PPO:
         self,
         config: PPOConfig,
         policy: Policy,
-        critics: Mapping[str, Network],
-        observation_size: int,
+        critics: Mapping[str, Critic],
+        normaliser: RunningNormaliser,
         generator: np.random.Generator,
     ) -> None:
         self.config = config
         self.policy = policy
-        self.critics = dict(critics)  # each with one output
+        self.critics = dict(critics)
         self.optimisers = {
             "actor": Adam(policy.parameters, config.actor_learning_rate, config.max_gradient_norm)
         } | {
-            kind: Adam(critic.parameters, config.critic_learning_rate, config.max_gradient_norm)
+            kind: critic.optimiser
             for kind, critic in critics.items()
+            if critic.optimiser is not None
         }
-        self.normaliser = RunningNormaliser(observation_size)
+        self.normaliser = normaliser
         self.minibatches = generator
+        smallest = {"extrinsic": (1.0, config.smallest_advantage)}
+        self.reward_scales, self.advantage_scales = {}, {}
+        for kind in critics:
+            least_reward, least_advantage = smallest.get(kind, (TINY, TINY))
+            self.reward_scales[kind] = RewardScale(config.discount, least_reward)
+            self.advantage_scales[kind] = AdvantageScale(least_advantage)
 
     def normalise(self, observations: np.ndarray) -> np.ndarray:
         """What the networks see of `observations`, float32 [N, observation]."""
@@ -115,16 +192,25 @@ class PPO:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
-        observations: normalised, [T + 1, observation]. A terminal state is worth 0; a state the
-        time limit cut off at is worth what the critic says.
+        observations: normalised, [T + 1, observation]; rewards: [T], as they were paid. A terminal
+        state is worth 0; a state the time limit cut off at is worth what the critic says. With
+        `scale_rewards` all is in units of the reward's scale, this episode included.
         """
-        values = self.critics[kind].forward(observations).outputs[:, 0].astype(np.float64)
+        if self.config.scale_rewards:
+            self.reward_scales[kind].update(rewards)
+            rewards = rewards / self.reward_scales[kind].value
+        values = self.critics[kind].values(observations)
         if terminated:
             values[-1] = 0.0
         advantages = generalised_advantages(
             rewards, values, self.config.discount, self.config.gae_lambda
         )
+        self.advantage_scales[kind].update(advantages)
         return advantages, advantages + values[:-1]
+
+    def advantage_scale(self, kind: str) -> float:
+        """What advantages of one kind are divided by before β weighs them."""
+        return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
 
     def update(self, batch: Batch) -> Update:
         """K epochs over `batch`."""
@@ -137,9 +223,10 @@ class PPO:
                 update.clip_fraction += share * clipped
                 update.entropy += share * entropy
                 update.gradient_norms["actor"] = self.optimisers["actor"].step(gradient)
-                for kind in self.critics:
-                    gradient = self.critic_gradient(kind, minibatch)
-                    update.gradient_norms[kind] = self.optimisers[kind].step(gradient)
+                for kind, critic in self.critics.items():
+                    update.gradient_norms[kind] = critic.learn(minibatch)
+        for critic in self.critics.values():
+            critic.remember(batch)
         return update
 
     def actor_gradient(self, batch: Batch) -> tuple[np.ndarray, float, float, float]:
@@ -164,17 +251,6 @@ class PPO:
         count = len(batch)
         return -(total / np.float32(count)), divergence / count, outside / count, entropy / count
 
-    def critic_gradient(self, kind: str, batch: Batch) -> np.ndarray:
-        """Gradient of the mean squared error of a critic's V(s) against the λ-returns."""
-        critic = self.critics[kind]
-        total: np.ndarray | None = None
-        for steps in batch.blocks():
-            trace = critic.forward(steps.observations)
-            errors = trace.outputs - steps.returns[kind][:, None]
-            gradient = critic.backward(trace, 2 * errors)
-            total = gradient if total is None else total + gradient
-        return total / np.float32(len(batch))
-
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
@@ -197,14 +273,24 @@ class PPO:
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, normaliser and generator."""
         return {
-            "optimisers": {name: adam.state_dict() for name, adam in self.optimisers.items()},
+            "actor": self.optimisers["actor"].state_dict(),
+            "critics": {kind: critic.state_dict() for kind, critic in self.critics.items()},
             "normaliser": self.normaliser.state_dict(),
             "minibatches": self.minibatches.bit_generator.state,
+            "scales": [
+                {kind: scale.state_dict() for kind, scale in scales.items()}
+                for scales in (self.reward_scales, self.advantage_scales)
+            ],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        for name, adam in self.optimisers.items():
-            adam.load_state_dict(state["optimisers"][name])
+        self.optimisers["actor"].load_state_dict(state["actor"])
+        for kind, critic in self.critics.items():
+            critic.load_state_dict(state["critics"][kind])
         self.normaliser.load_state_dict(state["normaliser"])
         self.minibatches.bit_generator.state = state["minibatches"]
+        scales = self.reward_scales, self.advantage_scales
+        for group, saved in zip(scales, state["scales"], strict=True):
+            for kind, scale in group.items():
+                scale.load_state_dict(saved[kind])

@@ -1,11 +1,18 @@
 """The interface of whatever sets β, and the choice of it."""
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mace_rl.environments.rollout import Episode
+
+
+class Effect(NamedTuple):
+    """What the β of one episode changes in the update on it."""
+
+    direction: np.ndarray  # dθ'/dβ as the optimiser steps, up to a factor, float32 [n]
+    influence: float  # RMS of what β weighs: the episode's intrinsic advantages, in their scale
 
 
 class BetaController(ABC):
@@ -25,12 +32,12 @@ class BetaController(ABC):
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """Take in a finished episode and its curiosity bonus, [T]; `beta` is then the next's."""
 
-    def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> float | None:
-        """After each rollout, before the policy's update on it: the flat policy gradients.
+    def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
+        """After each rollout, before the policy's update on it: what the βs do to the policy.
 
-        extrinsic: g_E of the whole rollout; intrinsic: for each of its episodes, in order, the
-        derivative dg/dβ of the update's direction. Returns the mean credit of the βs that it could
-        judge, or None.
+        gradient: g_E, the policy gradient of the rollout's extrinsic return, [n]; strength: RMS of
+        the extrinsic advantages in their scale; effects: of each of its episodes, in order. Returns
+        the mean credit of the βs that were judged now, or None.
         """
         raise NotImplementedError("this rule for β does not learn")
 

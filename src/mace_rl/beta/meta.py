@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
@@ -12,25 +13,40 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.network import Trace
 from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.beta.controller import BetaController
+from mace_rl.beta.controller import BetaController, Effect
 from mace_rl.beta.lstm import meta_network
+from mace_rl.beta.progress import Progress
 from mace_rl.config.run import MetaConfig
 from mace_rl.environments.rollout import Episode
+
+SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
+
+
+@dataclass
+class Judged:
+    """The β of one episode, while the updates that follow tell what it did."""
+
+    source: np.ndarray | None  # what the LSTM read for it; None for the first, which is given
+    direction: np.ndarray  # what it changes in the policy, of length 1, or 0
+    influence: float  # how much of a change that is, at most 1
+    credit: float = 0.0
+    updates: int = 0  # that judged it so far
 
 
 class MetaAdaptation(BetaController):
     """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
 
-    The update on episode n moves the policy along g(β_n), the policy gradient of the total reward.
-    How the extrinsic return of the policy that results depends on β_n is therefore
+    The update on episode n moves the policy along P g(β_n), with g the policy gradient of the total
+    advantage and P what Adam divides by. How the extrinsic return of the policies that result
+    depends on β_n is therefore, up to a positive factor,
 
-        dJ_E / dβ_n ≈ η ⟨g_E(θ'; episode n+1), dg/dβ_n (θ; episode n)⟩
+        c_n = Σ_k ⟨g_E(θ_{n+k}; episode n+k), P dg/dβ_n (θ_n; episode n)⟩,   k = 1 … horizon.
 
-    and by the chain rule through β_n = LSTM_φ(episode n-1) it trains φ. g_E is scaled to length 1
-    and dg/dβ by the length of g, which is what gradient clipping and Adam make of the step.
+    Each term is measured in units of its usual size, with both vectors per unit of advantage, and
+    counts as much as there is of extrinsic and of intrinsic advantage: where nothing is left to
+    learn, or β weighs nothing, there is no signal. By the chain rule through β_n's logit it trains
+    the LSTM, with a pull to the logit of the initial β. `docs/method.md` derives it.
     """
-
-    learns = True
 
     def __init__(
         self,
@@ -43,19 +59,21 @@ class MetaAdaptation(BetaController):
     ) -> None:
         self.config = config
         self.initial = initial
+        self.learns = config.learning_rate > 0
         self.action_count = int(action_space.n) if isinstance(action_space, Discrete) else 0
         action_size = self.action_count or action_space.shape[0]
-        inputs = observation_size + action_size + 2
+        inputs = observation_size + action_size + 2 + Progress.SIZE
         self.network = meta_network(inputs, config.hidden_units, initial, engine, generator)
         self.optimiser = Adam(
             self.network.parameters, config.learning_rate, config.max_gradient_norm
         )
         self.normaliser = RunningNormaliser(observation_size)
+        self.progress = Progress()
         # What the LSTM read for the β of each episode since the last `learn`, and for that of the
-        # next; None for the first episode, whose β is given.
+        # next; None for the first episode.
         self.sources: deque[np.ndarray | None] = deque([None])
-        # The same with dg/dβ for the episodes of the last rollout, whose effect is not yet known.
-        self.pending: list[tuple[np.ndarray | None, np.ndarray]] = []
+        self.judged: list[Judged] = []
+        self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 
     @property
     def beta(self) -> float:
@@ -65,15 +83,18 @@ class MetaAdaptation(BetaController):
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
+        beta = self.beta
         self.normaliser.update(episode.observations[:-1])
-        self.sources.append(self.sequence(episode, bonus))
+        self.progress.update(float(episode.rewards.sum()))
+        self.sources.append(self.sequence(episode, bonus, beta))
 
-    def sequence(self, episode: Episode, bonus: np.ndarray) -> np.ndarray:
+    def sequence(self, episode: Episode, bonus: np.ndarray, beta: float) -> np.ndarray:
         """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
 
-        float32 [min(T, max_sequence), input]. Longer episodes are cut into equal stretches: mean
-        state and action, and the sums of reward and bonus, as sign(x) log(1 + |x|), so that the
-        return can be read off and rewards of any size fit.
+        Beside them, at every step, how training goes (`Progress`). float32 [min(T, max_sequence),
+        input]. Longer episodes are cut into equal stretches: mean state and action, and the sums of
+        reward and bonus, as sign(x) log(1 + |x|), so that the return can be read off and rewards of
+        any size fit.
         """
         actions = episode.actions
         if self.action_count:
@@ -87,57 +108,94 @@ class MetaAdaptation(BetaController):
             seen = np.add.reduceat(seen, starts) / counts[:, None]
             rewards = np.add.reduceat(rewards, starts)
         rewards = np.sign(rewards) * np.log1p(np.abs(rewards))
-        return np.concatenate([seen, rewards], axis=1).astype(np.float32)
+        training = np.tile(self.progress.features(beta), (len(rewards), 1))
+        return np.concatenate([seen, rewards, training], axis=1).astype(np.float32)
 
-    def learn(self, extrinsic: np.ndarray, intrinsic: list[np.ndarray]) -> float | None:
-        """See `BetaController`: credit the βs of the last rollout, then remember this one's."""
-        credited = [
-            (sequence, alignment(extrinsic, change))
-            for sequence, change in self.pending
-            if sequence is not None
-        ]
-        if credited:
-            # Adam descends, so what it gets is minus the mean.
-            gradients = (
-                self.beta_gradient(sequence, -credit / len(credited))
-                for sequence, credit in credited
-            )
-            self.optimiser.step(reduce(np.add, gradients))
-        self.pending = [(self.sources.popleft(), change) for change in intrinsic]
-        return sum(credit for _, credit in credited) / len(credited) if credited else None
+    def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
+        """See `BetaController`: judge the βs of the last updates, then remember this one's."""
+        for judged in self.judged:
+            judged.credit += self.alignment(gradient, strength, judged)
+            judged.updates += 1
+        done = [judged for judged in self.judged if judged.updates == self.config.horizon]
+        self.judged = self.judged[len(done) :]
+        self.judged += [self.judge(self.sources.popleft(), effect) for effect in effects]
+        done = [judged for judged in done if judged.source is not None]
+        if not done:
+            return None
+        credits = [self.bounded(judged.credit) for judged in done]
+        # Adam descends, so what it gets is minus the mean.
+        gradients = (
+            self.logit_gradient(judged.source, credit, -1 / len(done))
+            for judged, credit in zip(done, credits, strict=True)
+        )
+        self.optimiser.step(reduce(np.add, gradients))
+        return sum(credits) / len(credits)
 
-    def beta_gradient(self, sequence: np.ndarray, weight: float = 1.0) -> np.ndarray:
-        """`weight` · dβ/dφ for one episode, float32 [T, input]: φ are the parameters, [n]."""
-        trace = self.network.forward(sequence)
-        beta = beta_of(trace)
-        return self.network.backward(trace, np.array([weight * beta * (1 - beta)], np.float32))
+    def judge(self, source: np.ndarray | None, effect: Effect) -> Judged:
+        """The β that the LSTM set for what is in `source` and that had this effect."""
+        length = float(np.linalg.norm(effect.direction))
+        direction = effect.direction / np.float32(length) if length > 0 else effect.direction
+        return Judged(source, direction, min(1.0, effect.influence))
+
+    def alignment(self, gradient: np.ndarray, strength: float, judged: Judged) -> float:
+        """One term of the credit, in units of its running root mean square."""
+        if not strength > 0:
+            return 0.0
+        along = float(gradient @ judged.direction) / strength
+        self.alignments = SCALE_DECAY * self.alignments + along**2
+        self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
+        if self.alignments == 0:
+            return 0.0
+        usual = math.sqrt(self.alignments / self.alignment_weight)
+        return along / usual * min(1.0, strength) * judged.influence
+
+    def bounded(self, credit: float) -> float:
+        """A sum of `horizon` terms as one whose noise has size 1, within `max_credit`."""
+        bound = self.config.max_credit
+        return min(max(credit / math.sqrt(self.config.horizon), -bound), bound)
+
+    def logit_gradient(self, source: np.ndarray, credit: float, weight: float = 1.0) -> np.ndarray:
+        """`weight` · (credit - prior · (logit - initial logit)) · dlogit/dφ, float32 [n].
+
+        By the logit and not by β, whose derivative β (1 - β) would hold a β near 0 or 1 for ever.
+        source: float32 [T, input]; φ are the parameters, [n].
+        """
+        trace = self.network.forward(source)
+        away = float(trace.outputs[0]) - math.log(self.initial / (1 - self.initial))
+        step = credit - self.config.prior * away
+        return self.network.backward(trace, np.array([weight * step], np.float32))
 
     def state_dict(self) -> dict[str, Any]:
         """See `BetaController`."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "normaliser": self.normaliser.state_dict(),
+            "progress": self.progress.state_dict(),
             "sources": [as_tensor(source) for source in self.sources],
-            "pending": [(as_tensor(source), as_tensor(change)) for source, change in self.pending],
+            "judged": [
+                {"source": as_tensor(item.source), "direction": torch.from_numpy(item.direction)}
+                | {"influence": item.influence, "credit": item.credit, "updates": item.updates}
+                for item in self.judged
+            ],
+            "alignments": [self.alignments, self.alignment_weight],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `BetaController`."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.normaliser.load_state_dict(state["normaliser"])
+        self.progress.load_state_dict(state["progress"])
         self.sources = deque(as_array(source) for source in state["sources"])
-        self.pending = [(as_array(source), as_array(change)) for source, change in state["pending"]]
+        self.judged = [
+            Judged(**item | {name: as_array(item[name]) for name in ("source", "direction")})
+            for item in state["judged"]
+        ]
+        self.alignments, self.alignment_weight = state["alignments"]
 
 
 def beta_of(trace: Trace) -> float:
     """β in (0, 1): the logistic function of the network's output, without overflow."""
     return 0.5 + 0.5 * math.tanh(0.5 * float(trace.outputs[0]))
-
-
-def alignment(extrinsic: np.ndarray, change: np.ndarray) -> float:
-    """The part of `change` along the extrinsic gradient: ⟨g_E, change⟩ / |g_E|; 0 if g_E is 0."""
-    length = np.linalg.norm(extrinsic)
-    return float(extrinsic @ change / length) if length > 0 else 0.0
 
 
 def as_tensor(array: np.ndarray | None) -> torch.Tensor | None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from mace_rl.beta.controller import BetaController
-from mace_rl.config.run import ExponentialBeta
+from mace_rl.config.run import ConstantBeta, ExponentialBeta
 from mace_rl.environments.rollout import Episode
 
 
@@ -32,3 +32,25 @@ class ExponentialSchedule(BetaController):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `BetaController`."""
         self.episodes = state["episodes"]
+
+
+class Constant(BetaController):
+    """One β for every episode."""
+
+    def __init__(self, config: ConstantBeta) -> None:
+        self.config = config
+
+    @property
+    def beta(self) -> float:
+        """See `BetaController`."""
+        return self.config.value
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """See `BetaController`."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `BetaController`."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `BetaController`."""

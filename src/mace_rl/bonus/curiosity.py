@@ -1,53 +1,49 @@
 """The curiosity bonus: novelty × what the episodic memory says of similar states (paper)."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
-from numba import njit
 
 from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.bonus.novelty import novelty
 from mace_rl.config.run import MemoryConfig, NoveltyConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.streams import Streams
 
+SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
 
-@njit(cache=True, error_model="numpy")
-def relevance(similarity, recalled, returns):
+
+def relevance(similarity, recalled, worst, best):
     """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
 
-    similarity: [N]; recalled: remembered return-to-go, [N]. Productivity is where it lies among all
-    `returns` in memory, [M]: the logistic function of its distance from their mean in standard
-    deviations. So a state unlike anything remembered has relevance 1, one like unproductive states
-    goes toward 0, and one like productive states stays near 1.
+    similarity: [N]; recalled: remembered return-to-go, [N]. Productivity is how far the recalled
+    return lies on the way from the `worst` to the `best` return that memory holds, in [0, 1]; 0
+    where none is better than another. So a state unlike anything remembered has relevance 1, one
+    like unproductive states goes toward 0, and one like productive states stays near 1.
     """
-    mean = returns.astype(np.float64).mean()
-    # Not below float32's rounding, which would decide if all returns were equal.
-    spread = np.sqrt(np.square(returns - mean).mean()) + 1e-6 * np.abs(returns).mean() + 1e-8
-    return 1 - similarity * (1 - 1 / (1 + np.exp((mean - recalled) / spread)))
+    span = best - worst
+    if not span > SMALLEST_SPAN:
+        return 1.0 - similarity
+    productivity = np.clip((recalled - worst) / span, 0, 1)
+    return 1 - similarity * (1 - productivity)
 
 
-class Bonus(NamedTuple):
-    """The curiosity bonus of an episode and what it is made of, float64 [T] each."""
-
-    reward: np.ndarray  # R_curiosity = novelty × relevance
-    novelty: np.ndarray
-    relevance: np.ndarray
-    similarity: np.ndarray  # to what memory holds, in [0, 1]
-
-
-class Curiosity:
+class Curiosity(IntrinsicReward):
     """R_curiosity of every step, and the memory and novelty estimates it rests on.
 
     An episode is rewarded for what was known before it; `remember` adds it to what is known.
+    Without a memory all is relevant: the bonus is the novelty.
     """
+
+    largest = 1.0
 
     def __init__(
         self,
-        memory: MemoryConfig,
+        memory: MemoryConfig | None,
         novelty_config: NoveltyConfig,
         engine: str,
         observation_space: Box | Discrete,
@@ -55,9 +51,10 @@ class Curiosity:
         streams: Streams,
     ) -> None:
         self.config = memory
-        self.memory = EpisodicMemory(memory, observation_size)
+        self.memory = None if memory is None else EpisodicMemory(memory, observation_size)
         # States are compared as this normaliser sees them; one-hot states as they are.
         self.normaliser = RunningNormaliser(observation_size)
+        self.steps = 0  # remembered or not
         self.discrete = isinstance(observation_space, Discrete)
         self.novelty = novelty(novelty_config, engine, observation_space, self.normaliser, streams)
 
@@ -65,6 +62,8 @@ class Curiosity:
         """R_curiosity of each step: novelty × relevance of the state it led to."""
         states = episode.observations[1:]
         new = self.novelty(states)
+        if self.memory is None:
+            return Bonus(new, new, np.ones(len(new)))
         if len(self.memory) == 0:
             return Bonus(new, new, np.ones(len(new)), np.zeros(len(new)))
         recollection = self.memory.lookup(
@@ -73,7 +72,9 @@ class Curiosity:
             torch.from_numpy(self.scale().astype(np.float32)),
         )
         similarity, recalled = recollection.similarity.numpy(), recollection.values[:, -1].numpy()
-        relevant = relevance(similarity, recalled, self.memory.returns.numpy())
+        remembered = self.memory.values[: len(self.memory), -1].numpy()
+        worst, best = float(remembered.min()), float(remembered.max())
+        relevant = relevance(similarity.astype(np.float64), recalled, worst, best)
         return Bonus(new * relevant, new, relevant, similarity)
 
     def scale(self) -> np.ndarray:
@@ -90,27 +91,39 @@ class Curiosity:
 
         returns: extrinsic return-to-go of each step, [T], as its λ-return.
         """
-        chosen = slice(None, None, self.config.write_every)
+        if self.memory is not None:
+            self._memorise(episode, returns)
+        if not self.discrete:
+            self.normaliser.update(episode.observations[1:])
+        self.novelty.observe(episode.observations[1:])
+
+    def _memorise(self, episode: Episode, returns: np.ndarray) -> None:
+        # One step in so many, counted across episodes, and the last, which had the outcome.
+        chosen = np.arange(
+            -self.steps % self.config.write_every, len(episode), self.config.write_every
+        )
+        chosen = np.union1d(chosen, len(episode) - 1)
+        self.steps += len(episode)
         self.memory.write(
             torch.from_numpy(episode.observations[:-1][chosen]),
             torch.from_numpy(episode.observations[1:][chosen]),
             torch.from_numpy(episode.rewards[chosen]),
             torch.from_numpy(returns[chosen]),
         )
-        if not self.discrete:
-            self.normaliser.update(episode.observations[1:])
-        self.novelty.observe(episode.observations[1:])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""
         return {
-            "memory": self.memory.state_dict(),
+            "memory": None if self.memory is None else self.memory.state_dict(),
+            "steps": self.steps,
             "normaliser": self.normaliser.state_dict(),
             "novelty": self.novelty.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.memory.load_state_dict(state["memory"])
+        if self.memory is not None:
+            self.memory.load_state_dict(state["memory"])
+        self.steps = state["steps"]
         self.normaliser.load_state_dict(state["normaliser"])
         self.novelty.load_state_dict(state["novelty"])

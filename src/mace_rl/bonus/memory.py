@@ -7,8 +7,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from mace_rl.bonus.nearest import nearest
 from mace_rl.config.run import MemoryConfig
+from mace_rl.nearest import nearest
 
 
 class Recollection(NamedTuple):
@@ -31,18 +31,14 @@ class EpisodicMemory:
         self.config = config
         self.keys = torch.zeros(config.capacity, key_size)
         self.values = torch.zeros(config.capacity, key_size + 2)
-        # For each entry the time of its last reading or writing; 0 for an empty one. Of equally
-        # old ones the first is overwritten, so entries fill up in order.
+        # For each entry the time of its last reading or writing, and its number among all that were
+        # ever written, from 1; 0 for an empty one.
         self.usage = np.zeros(config.capacity, np.int64)
+        self.number = np.zeros(config.capacity, np.int64)
         self.time = 0
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.usage))
-
-    @property
-    def returns(self) -> Tensor:
-        """Return-to-go of every remembered state, [len(self)]."""
-        return self.values[: len(self), -1]
 
     def write(self, keys: Tensor, next_states: Tensor, rewards: Tensor, returns: Tensor) -> None:
         """Store N experiences over the least recently used entries.
@@ -53,11 +49,15 @@ class EpisodicMemory:
         self.time += 1
         written = [part.numpy()[-self.config.capacity :] for part in (keys, next_states)]
         outcome = [part.numpy()[-self.config.capacity :] for part in (rewards, returns)]
-        oldest = np.argsort(self.usage, kind="stable")[: len(written[0])]
+        # A lookup of a long episode reads nearly every entry: of equally used ones the earliest
+        # written goes, or entries that are read for ever would never be outdated.
+        count = len(written[0])
+        oldest = np.lexsort((self.number, self.usage))[:count]
         values = self.values.numpy()
         self.keys.numpy()[oldest], values[oldest, :-2] = written
         values[oldest, -2], values[oldest, -1] = outcome
         self.usage[oldest] = self.time
+        self.number[oldest] = self.number.max() + np.arange(1, count + 1)
 
     def lookup(self, queries: Tensor, mean: Tensor, std: Tensor) -> Recollection:
         """Kernel-weighted mean of the k nearest entries' values for each query, [N, key].
@@ -65,15 +65,19 @@ class EpisodicMemory:
         Distances are Euclidean between (x - mean) / std of query and key; the kernel is
         1 / (d² + δ) (Pritzel et al. 2017, eq. 5), with d² per dimension so that δ does not depend
         on the number of dimensions. Differentiable with respect to queries and values. Every
-        entry that is read counts as used now. Raises `LookupError` if nothing is stored.
+        entry that is read counts as used now; of equally near ones the last written are read, so
+        that what came of a state lately is what is remembered of it. Raises `LookupError` if
+        nothing is stored.
         """
         stored = len(self)
         if stored == 0:
             raise LookupError("the episodic memory is empty")
-        points = (queries.detach(), self.keys[:stored], mean, std)
-        squared_distances, indices = nearest(
+        newest_first = np.argsort(-self.number[:stored])
+        points = (queries.detach(), self.keys[newest_first], mean, std)
+        squared_distances, places = nearest(
             *(tensor.float().numpy() for tensor in points), min(self.config.neighbours, stored)
         )
+        indices = newest_first[places]
         self.time += 1
         self.usage[indices] = self.time
         bandwidth = self.config.kernel_bandwidth
@@ -96,13 +100,15 @@ class EpisodicMemory:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""
-        usage = torch.from_numpy(self.usage)
-        return {"keys": self.keys, "values": self.values, "usage": usage, "time": self.time}
+        counters = {"usage": self.usage, "number": self.number}
+        tensors = {name: torch.from_numpy(counter) for name, counter in counters.items()}
+        return {"keys": self.keys, "values": self.values, "time": self.time, **tensors}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.keys, self.values = state["keys"].clone(), state["values"].clone()
-        self.usage, self.time = state["usage"].numpy().copy(), state["time"]
+        self.usage, self.number = (state[name].numpy().copy() for name in ("usage", "number"))
+        self.time = state["time"]
 
 
 @njit(cache=True, error_model="numpy")

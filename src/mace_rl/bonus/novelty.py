@@ -10,12 +10,14 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.density import DensityEstimator
-from mace_rl.bonus.nearest import nearest
 from mace_rl.config.plugins import make
 from mace_rl.config.run import NoveltyConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.finite import require_finite
+from mace_rl.nearest import nearest
 from mace_rl.streams import Streams
+
+KNOWN = 0.9  # the share of visited states that count as known
 
 
 class Novelty(ABC):
@@ -103,13 +105,16 @@ class CountNovelty(Novelty):
 class DensityNovelty(Novelty):
     """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
 
-    Both refer to a buffer of the last visited states, as `normaliser` sees them, whose owner keeps
-    it up to date.
+    Both refer to a buffer that covers the visited states, as `normaliser` sees them, whose owner
+    keeps it up to date: once it is full, a state that is far from it takes the place of one that is
+    close to another. Both are measured against what is usual there: after each episode a sample of
+    visited states says how far a known state is from its neighbours, and how likely. A state no
+    farther and no less likely than `KNOWN` of them has novelty 0.
 
-    - k-NN: 1 - exp(-d_k), d_k the mean distance to the k nearest visited states, per dimension
-      (root mean square); the mean over the ensemble's ks.
-    - Density: the fraction of visited states at which the estimator, trained on the buffer after
-      each episode, finds a higher density than here.
+    - k-NN: 1 - d*/d, with d the mean distance to the k nearest visited states and d* what is usual;
+      the mean over the ensemble's ks.
+    - Density: 1 - exp(-(l* - l) / D), with l the log-density, l* what is usual, in nats per
+      dimension, of D that vary.
     """
 
     def __init__(
@@ -123,69 +128,122 @@ class DensityNovelty(Novelty):
         self.config = config
         self.normaliser = normaliser
         self.buffer = np.zeros((config.buffer_size, size), np.float32)
-        self.seen = 0  # states ever written; the buffer is a ring
+        self.seen = 0  # states written until the buffer was full
+        self.steps = 0  # states ever observed, of which one in `write_every` is written
         self.density = DensityEstimator(
             size, config.density_hidden_units, engine, streams["density"]
         )
         self.optimiser = Adam(self.density.network.parameters, config.density_learning_rate)
         self.batches = streams["density_batches"]
-        self.reference = np.zeros(0, np.float32)  # sorted log-densities of visited states
+        self.usual_distances = np.zeros(len(config.neighbours))
+        self.usual_log_density = 0.0
 
     @property
     def visited(self) -> np.ndarray:
         """The states in the buffer, [n, observation]."""
         return self.buffer[: min(self.seen, len(self.buffer))]
 
+    @property
+    def dimensions(self) -> int:
+        """How many dimensions of the observation have varied, at least 1."""
+        return max(1, int(self.normaliser.varied.sum()))
+
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """See `Novelty`. Before anything was visited everything has novelty 1."""
-        if self.seen == 0:
+        if self.seen <= max(self.config.neighbours):
             return np.ones(len(states))
         weight = self.config.knn_weight
         return weight * self.knn_novelty(states) + (1 - weight) * self.density_novelty(states)
 
-    def knn_novelty(self, states: np.ndarray) -> np.ndarray:
-        """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
+    def distances(self, states: np.ndarray, skip: int = 0) -> np.ndarray:
+        """Mean distances to the k nearest visited states but the `skip` first, [T, ensemble]."""
         visited, normaliser = self.visited, self.normaliser
-        largest = min(max(self.config.neighbours), len(visited))
+        largest = min(max(self.config.neighbours) + skip, len(visited))
         mean, std = normaliser.mean.astype(np.float32), normaliser.std.astype(np.float32)
         squared_distances, _ = nearest(states, visited, mean, std, largest)
-        distances = np.sqrt(squared_distances / states.shape[1], dtype=np.float64)
-        neighbours = np.minimum(self.config.neighbours, largest)
-        means = distances.cumsum(axis=1)[:, neighbours - 1] / neighbours  # [T, ensemble]
-        return (1 - np.exp(-means)).mean(axis=1)
+        distances = np.sqrt(squared_distances[:, skip:], dtype=np.float64)
+        neighbours = np.minimum(self.config.neighbours, largest - skip)
+        return distances.cumsum(axis=1)[:, neighbours - 1] / neighbours
+
+    def knn_novelty(self, states: np.ndarray) -> np.ndarray:
+        """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
+        distances, usual = self.distances(states), self.usual_distances
+        # Where states repeat exactly both are 0, and what is known is still not new.
+        share = np.divide(usual, distances, out=np.ones_like(distances), where=distances > usual)
+        return (1 - share).mean(axis=1)
 
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
-        log_probs = self.density.log_prob(self.normaliser(states))
-        return 1 - np.searchsorted(self.reference, log_probs) / len(self.reference)
+        lack = self.usual_log_density - self.density.log_prob(self.normaliser(states))
+        return 1 - np.exp(-np.maximum(lack.astype(np.float64), 0) / self.dimensions)
 
     def observe(self, states: np.ndarray) -> None:
         """Add one in `write_every` of an episode's states and train the density estimator."""
-        chosen = states[:: self.config.write_every]
-        indices = np.arange(self.seen, self.seen + len(chosen)) % len(self.buffer)
-        self.buffer[indices] = chosen
-        self.seen += len(chosen)
+        chosen = states[-self.steps % self.config.write_every :: self.config.write_every]
+        self.steps += len(states)
+        free = len(self.buffer) - self.seen
+        self.buffer[self.seen : self.seen + len(chosen[:free])] = chosen[:free]
+        self.seen += len(chosen[:free])
+        if len(chosen) > free:
+            self._replace_redundant(chosen[free:])
         visited = self.visited
+        if len(visited) <= max(self.config.neighbours):
+            return
         shape = self.config.density_steps, self.config.density_batch_size
-        for sample in self.normaliser(visited[self.batches.integers(len(visited), size=shape)]):
+        samples = visited[self.batches.integers(len(visited), size=shape)]
+        for sample in self.normaliser(samples):
             self.optimiser.step(-self.density.gradient(sample))
-        self.reference = np.sort(self.density.log_prob(sample))
-        require_finite("a log-density", self.reference)
+        log_probs = self.density.log_prob(self.normaliser(samples[-1]))
+        require_finite("a log-density", log_probs)
+        self.usual_log_density = float(np.quantile(log_probs, 1 - KNOWN))
+        known = samples[-1][: self.config.calibration_states]  # a visited state's nearest is itself
+        self.usual_distances = np.quantile(self.distances(known, skip=1), KNOWN, axis=0)
+
+    def _replace_redundant(self, states: np.ndarray) -> None:
+        """Let states that are far from the buffer take the places of entries close to others.
+
+        One after the other, the farthest first: once in the buffer a state is near its like, and an
+        entry whose nearest neighbour has just gone is not redundant any more.
+        """
+        mean = self.normaliser.mean.astype(np.float32)
+        std = self.normaliser.std.astype(np.float32)
+        sample = self.batches.integers(len(self.buffer), size=self.config.calibration_states)
+        sample = np.unique(sample)
+        apart = nearest(states, self.buffer, mean, std, 1)[0][:, 0]
+        squared, neighbours = nearest(self.buffer[sample], self.buffer, mean, std, 2)
+        itself_first = neighbours[:, 0] == sample  # not where entries are equal
+        squared, neighbours = (
+            squared[:, 1],
+            np.where(itself_first, neighbours[:, 1], neighbours[:, 0]),
+        )
+        gone = set()
+        for old in np.argsort(squared):
+            new = int(np.argmax(apart))
+            if not apart[new] > squared[old]:
+                break
+            if int(neighbours[old]) in gone:
+                continue
+            gone.add(int(sample[old]))
+            self.buffer[sample[old]] = states[new]
+            apart = np.minimum(apart, nearest(states, states[[new]], mean, std, 1)[0][:, 0])
 
     def state_dict(self) -> dict[str, Any]:
         """See `Novelty`."""
         return {
             "buffer": torch.from_numpy(self.visited.copy()),
             "seen": self.seen,
+            "steps": self.steps,
             "density": self.optimiser.state_dict(),
             "batches": self.batches.bit_generator.state,
-            "reference": torch.from_numpy(self.reference),
+            "usual_distances": torch.from_numpy(self.usual_distances),
+            "usual_log_density": self.usual_log_density,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `Novelty`."""
         self.buffer[: len(state["buffer"])] = state["buffer"].numpy()
-        self.seen = state["seen"]
+        self.seen, self.steps = state["seen"], state["steps"]
         self.optimiser.load_state_dict(state["density"])
         self.batches.bit_generator.state = state["batches"]
-        self.reference = state["reference"].numpy().copy()
+        self.usual_distances = state["usual_distances"].numpy().copy()
+        self.usual_log_density = state["usual_log_density"]

@@ -1,10 +1,21 @@
 """How runs are measured, and how Figure 1 is laid out."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from mace_rl.config.section import ConfigError, Reference, Section
+
+# What a metric may need of every environment of a study: a goal, as a return.
+GOALS = ("reference_return", "solved_return")
+
+
+class RegretConfig(Section):
+    """Whose regret is measured, against the best of which constants."""
+
+    variant: str
+    constants: list[str] = Field(min_length=1)  # variants too, such as those with a fixed β
 
 
 class MetricsConfig(Section):
@@ -13,13 +24,17 @@ class MetricsConfig(Section):
     final_fraction: float = Field(gt=0, le=1)  # the last part of training, for the final return
     threshold: float = Field(gt=0, lt=1)  # of the final return, for sample efficiency
     moving_average: PositiveInt  # W, episodes
+    convergence_slope: float = Field(ge=0, lt=1)  # of the steepest so far: diminishing returns
     convergence_band: float = Field(gt=0, lt=1)  # of the learning range, around the final return
     confidence: float = Field(gt=0, lt=1)  # of every interval
     bootstrap_repetitions: int = Field(ge=100)
     bootstrap_seed: NonNegativeInt
     random_return: dict[str, float]  # mean return of uniformly random actions, per environment
+    reference_return: dict[str, float] = Field(default={})  # sets one bar for all variants
+    solved_return: dict[str, float] = Field(default={})  # from which on an episode is solved
     # Which variant is compared with which, [variant, baseline], where the study has both.
     comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
+    regret: RegretConfig | None = None  # None: there is no regret.csv
     custom: list[Reference] = Field(default=[])  # further ones: mace_rl.results.metrics.Metric
 
     def random_return_in(self, environment: str) -> float:
@@ -30,6 +45,34 @@ class MetricsConfig(Section):
                 f" uniformly random actions in {environment}"
             )
         return self.random_return[environment]
+
+    @property
+    def goals(self) -> tuple[dict[str, float], ...]:
+        """The values of `GOALS`, by environment; empty for a study without them."""
+        return tuple(getattr(self, key) for key in GOALS)
+
+    def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
+        """These settings for a study of these environments and variants.
+
+        Of `GOALS`, what not every environment has is left out. Raises `ConfigError` for a goal that
+        random actions attain, and for a regret of variants that the study does not have.
+        """
+        goals: dict[str, dict[str, float]] = {}
+        for key in GOALS:
+            given = {
+                name: value for name, value in getattr(self, key).items() if name in environments
+            }
+            for name, value in given.items():
+                if value <= self.random_return_in(name):
+                    raise ConfigError(
+                        f"metrics.{key}.{name} is {value!r}, but should be greater than"
+                        f" metrics.random_return.{name}, {self.random_return[name]!r}"
+                    )
+            goals[key] = given if len(given) == len(environments) else {}
+        for variant in [self.regret.variant, *self.regret.constants] if self.regret else []:
+            if variant not in variants:
+                raise ConfigError(f"metrics.regret has {variant!r}, which is not in variants")
+        return self.model_copy(update=goals)
 
     def references(self) -> dict[str, str]:
         """By key, the code from outside this package that takes part, as package.module:Name."""

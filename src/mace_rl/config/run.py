@@ -5,7 +5,8 @@ this module says what each one means and which values are possible. A `RunConfig
 depends on besides the code: equal `RunConfig`s give equal results.
 """
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
@@ -19,7 +20,7 @@ from mace_rl.config.section import Reference, Section
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
-BONUS_SECTIONS = ("memory", "novelty")  # what only variants with a curiosity bonus use
+BONUS_SECTIONS = ("bonus", "memory", "novelty")  # what only variants with a bonus use
 
 
 class CompiledNetwork(Section):
@@ -39,6 +40,39 @@ class TorchModule(Section):
 NetworkConfig = CompiledNetwork | TorchModule
 
 
+class NetworkValue(Section):
+    """A critic that is a network, as the policy is."""
+
+    kind: Literal["network"]
+
+    def __str__(self) -> str:
+        return "network"
+
+
+class DictionaryValue(Section):
+    """A critic that is a dictionary of states and returns (Pritzel et al. 2017)."""
+
+    kind: Literal["dictionary"]
+    capacity: PositiveInt  # states
+    neighbours: PositiveInt  # k, whose returns make a value
+    kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
+    learning_rate: PositiveFloat = Field(le=1)  # α, at which a remembered state's return moves
+
+    def __str__(self) -> str:
+        return f"dictionary of {self.capacity} states"
+
+    @model_validator(mode="after")
+    def _neighbours_fit(self) -> "DictionaryValue":
+        if self.neighbours > self.capacity:
+            raise ValueError(
+                f"neighbours is {self.neighbours}, which must not exceed capacity, {self.capacity}"
+            )
+        return self
+
+
+CriticConfig = NetworkValue | DictionaryValue
+
+
 class PPOConfig(Section):
     """Proximal Policy Optimization (paper, Table 2; Schulman et al. 2017)."""
 
@@ -55,9 +89,18 @@ class PPOConfig(Section):
     minibatch_size: PositiveInt | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
     hidden_units: list[PositiveInt] = Field(min_length=1)
+    critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat
     normalise_observations: bool
+    # Rewards are divided by the running standard deviation of their discounted sums; extrinsic ones
+    # by at least 1, lest tiny costs be blown up.
+    scale_rewards: bool = False
+    # Extrinsic and intrinsic advantages are each divided by their running root mean square before β
+    # weighs them, extrinsic ones by at least `smallest_advantage`: β is then a relative strength.
+    scale_advantages: bool = False
+    smallest_advantage: PositiveFloat = 0.1
+    centre_advantages: bool = False  # subtract the rollout's mean from total advantages
 
 
 class MemoryConfig(Section):
@@ -86,14 +129,24 @@ class NoveltyConfig(Section):
     estimator: Reference | None = None
     arguments: dict[str, Any] = Field(default={})
     count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
-    buffer_size: PositiveInt  # visited states that k-NN and density refer to, the last ones ...
-    write_every: PositiveInt  # ... of every so many
+    buffer_size: PositiveInt  # visited states that k-NN and density refer to, a cover of ...
+    write_every: PositiveInt  # ... one in so many
     neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
+    calibration_states: PositiveInt = 32  # a sample of them says what distance is usual
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
     density_hidden_units: PositiveInt
     density_learning_rate: PositiveFloat = Field(lt=1)
     density_batch_size: PositiveInt
     density_steps: PositiveInt  # gradient steps of the density estimator after each episode
+
+    @model_validator(mode="after")
+    def _neighbours_fit(self) -> "NoveltyConfig":
+        if max(self.neighbours) >= self.buffer_size:
+            raise ValueError(
+                f"neighbours has {max(self.neighbours)}, which must be less than buffer_size,"
+                f" {self.buffer_size}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _estimator_if_custom(self) -> "NoveltyConfig":
@@ -104,12 +157,66 @@ class NoveltyConfig(Section):
         return self
 
 
+class CuriosityBonus(Section):
+    """Curiosity: novelty × memory relevance (paper); without `relevance`, novelty alone."""
+
+    kind: Literal["curiosity"]
+    relevance: bool = True
+
+
+class ICMBonus(Section):
+    """Intrinsic curiosity module (Pathak et al. 2017): `mace_rl.bonus.icm`."""
+
+    kind: Literal["icm"]
+    feature_units: PositiveInt = 32  # numbers in φ(s); the paper has 288 for images
+    hidden_units: PositiveInt = 64  # of the one hidden layer in each of its three networks
+    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper's
+    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+    forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
+    scale: PositiveFloat = 1.0  # η
+
+
+class RNDBonus(Section):
+    """Random network distillation (Burda et al. 2018): `mace_rl.bonus.rnd`."""
+
+    kind: Literal["rnd"]
+    feature_units: PositiveInt = 64  # outputs of both networks; the paper has 512 for images
+    hidden_units: PositiveInt = 64  # of the one hidden layer in each
+    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper has 0.0001, for images
+    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+
+
+class HashCountsBonus(Section):
+    """Counts of hashed states (Tang et al. 2017): `mace_rl.bonus.hashing`."""
+
+    kind: Literal["hash_counts"]
+    bits: int = Field(default=16, ge=1, le=62)  # k; more tell more states apart
+    calibration_states: PositiveInt = 1000  # the first visited; states are hashed in their units
+
+
+class CustomBonus(Section):
+    """A bonus from the class `estimator`, a `mace_rl.bonus.intrinsic.IntrinsicReward`.
+
+    It is made as estimator(size, action_space, generator, **arguments).
+    """
+
+    kind: Literal["custom"]
+    estimator: Reference
+    arguments: dict[str, Any] = Field(default={})
+
+
+BonusConfig = CuriosityBonus | ICMBonus | RNDBonus | HashCountsBonus | CustomBonus
+
+
 class MetaConfig(Section):
     """Meta-adaptation network: the LSTM that sets β (paper, supplement)."""
 
     hidden_units: PositiveInt
-    learning_rate: PositiveFloat = Field(lt=1)
+    learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
     max_gradient_norm: PositiveFloat
+    horizon: PositiveInt  # updates after an episode that judge its β
+    prior: NonNegativeFloat  # pull of β's logit back to the initial β's, per unit of distance
+    max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
     max_sequence: PositiveInt | None  # longer episodes are condensed to this many elements
 
 
@@ -117,6 +224,45 @@ class NoBonus(Section):
     """Plain PPO: no curiosity, no memory, β = 0."""
 
     kind: Literal["none"]
+
+
+class ConstantBeta(Section):
+    """The same β in every episode."""
+
+    kind: Literal["constant"]
+    value: float = Field(ge=0, le=1)
+
+
+class RandomBeta(Section):
+    """β uniform between `low` and `high`, drawn for every episode."""
+
+    kind: Literal["random"]
+    low: float = Field(ge=0, le=1)
+    high: float = Field(ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "RandomBeta":
+        if self.low > self.high:
+            raise ValueError(f"low is {self.low}, which must not exceed high, {self.high}")
+        return self
+
+
+class BanditBeta(Section):
+    """β from a bandit that follows the returns (Badia et al. 2020, appendix D)."""
+
+    kind: Literal["bandit"]
+    arms: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=1)  # the βs to choose from
+    window: PositiveInt  # pulls that count, the last ones
+    exploration: NonNegativeFloat  # of the bonus √(1 / pulls), in ranges of the return
+    epsilon: float = Field(ge=0, le=1)  # probability of an arm at random
+
+    @model_validator(mode="after")
+    def _arms_fit(self) -> "BanditBeta":
+        if self.window < len(self.arms):
+            raise ValueError(
+                f"window is {self.window}, which must hold each of the {len(self.arms)} arms"
+            )
+        return self
 
 
 class ExponentialBeta(Section):
@@ -146,14 +292,16 @@ class CustomBeta(Section):
     arguments: dict[str, Any] = Field(default={})
 
 
-BetaConfig = NoBonus | ExponentialBeta | MetaBeta | CustomBeta
+BetaConfig = (
+    NoBonus | ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | MetaBeta | CustomBeta
+)
 
 
 class RunConfig(Section):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `memory`, `novelty` and `meta` are there in variants that use them and None in the others, so
-    that a change of what a variant does not use leaves its runs alone.
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    others, so that a change of what a variant does not use leaves its runs alone.
     """
 
     environment: str
@@ -164,6 +312,7 @@ class RunConfig(Section):
     environment_arguments: dict[str, Any] = Field(default={})  # for the environment's constructor
     engine: Literal["compiled", "torch"] = "compiled"  # of every network
     ppo: PPOConfig
+    bonus: BonusConfig | None = Field(default=None, discriminator="kind")
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
@@ -172,14 +321,15 @@ class RunConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _only_what_is_used(cls, values: Any) -> Any:
-        beta = values.get("beta") if isinstance(values, dict) else None
-        kind = beta.get("kind") if isinstance(beta, dict) else getattr(beta, "kind", None)
-        unused = unused_sections(kind)
-        return {k: v for k, v in values.items() if k not in unused} if unused else values
+        if not isinstance(values, dict):
+            return values
+        unused = unused_sections(values)
+        values = {"bonus": {"kind": "curiosity"}} | values  # there was no other before
+        return {key: value for key, value in values.items() if key not in unused}
 
     @model_validator(mode="after")
     def _all_that_is_used(self) -> "RunConfig":
-        for section in {*BONUS_SECTIONS, "meta"} - set(unused_sections(self.beta.kind)):
+        for section in {*BONUS_SECTIONS, "meta"} - set(unused_sections(self)):
             if getattr(self, section) is None:
                 raise ValueError(f"the section {section!r} is missing")
         return self
@@ -193,18 +343,34 @@ class RunConfig(Section):
         found = {
             "environment": self.environment if ":" in self.environment else None,
             "ppo.network.module": getattr(self.ppo.network, "module", None),
+            "bonus.estimator": getattr(self.bonus, "estimator", None),
             "novelty.estimator": self.novelty.estimator if self.novelty else None,
             "beta.rule": getattr(self.beta, "rule", None),
         }
         return {key: reference for key, reference in found.items() if reference is not None}
 
 
-def unused_sections(beta: Any) -> tuple[str, ...]:
-    """The sections that a variant does not use whose β is of this kind; none for unknown kinds."""
-    match beta:
-        case "none":
-            return (*BONUS_SECTIONS, "meta")
-        case "exponential" | "custom":
-            return ("meta",)
-        case _:
-            return ()
+def unused_sections(settings: Any) -> dict[str, str]:
+    """The sections that a run with these settings does not use, each with what in them says so.
+
+    settings: a `RunConfig`, or plain values before they are checked.
+    """
+
+    def value(*keys: str) -> Any:
+        found = settings
+        for key in keys:
+            of_mapping = isinstance(found, Mapping)
+            found = found.get(key) if of_mapping else getattr(found, key, None)
+        return found
+
+    beta, bonus = value("beta", "kind"), value("bonus", "kind")
+    if beta == "none":
+        return dict.fromkeys((*BONUS_SECTIONS, "meta"), "beta.kind 'none'")
+    unused = {}
+    if beta in ("constant", "random", "bandit", "exponential", "custom"):
+        unused["meta"] = f"beta.kind {beta!r}"
+    if value("bonus", "relevance") is False:
+        unused["memory"] = "bonus.relevance false"
+    if bonus in ("icm", "rnd", "hash_counts", "custom"):
+        unused |= dict.fromkeys(("memory", "novelty"), f"bonus.kind {bonus!r}")
+    return unused

@@ -18,8 +18,9 @@ import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and 
 from matplotlib.colors import is_color_like
 from pydantic import AfterValidator, Field, ValidationError
 
+import mace_rl.environments  # noqa: F401  (registers our own)
 from mace_rl.config.plugins import import_module, load, source_file
-from mace_rl.config.reading import Settings, merge, read_yaml
+from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
 from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, explain, short
@@ -192,7 +193,7 @@ def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
                     f"{name}.{key} is {short(layer[key])}, but the lists environments, variants "
                     "and seeds say which runs there are"
                 )
-        settings = merge(settings, layer, whole={"beta"})
+        settings = merge_layers(settings, layer)
     settings |= {"environment": environment, "variant": variant, "seed": 0}
     try:
         config = RunConfig.model_validate(settings)
@@ -202,11 +203,11 @@ def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
         source_file(reference, f"in the settings of {environment} and {variant}, {key}")
-    for section in unused_sections(config.beta.kind):
+    for section, reason in unused_sections(config).items():
         if section in study.variant_settings[variant].settings:
             raise ConfigError(
                 f"variant_settings.{variant} has the section {section!r}, which a variant with "
-                f"beta.kind {config.beta.kind!r} does not use"
+                f"{reason} does not use"
             )
     return config
 

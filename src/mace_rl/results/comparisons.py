@@ -1,4 +1,4 @@
-"""Is one variant better than another? Compared on shared seeds, by environment and metric."""
+"""Is one variant better than another? Compared by environment and metric (docs/metrics.md)."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,16 @@ import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.statistics import holm, paired_comparison, probability_of_improvement
+from mace_rl.results.statistics import (
+    holm,
+    logrank,
+    paired_comparison,
+    percentiles,
+    probability_of_improvement,
+)
+
+ALL = "all"  # in the place of an environment: the mean over all of them
+UNTESTED = (np.nan, np.nan, np.nan, "", np.nan)  # difference to p_value of that
 
 
 class Comparison(NamedTuple):
@@ -18,50 +27,138 @@ class Comparison(NamedTuple):
     variant: str
     baseline: str
     seeds: int
-    censored: int  # runs of both that never got there: they count with the budget
-    difference: float  # mean of variant - baseline, in episodes or return
-    low: float  # of its interval
+    censored: int  # runs of both that never got there
+    difference: float  # mean of variant - baseline; of episodes, of restricted means
+    low: float  # of its interval, of differences paired by seed
     high: float
-    p_value: float  # two-sided, sign-flip test; with n seeds never below 2 / 2ⁿ
+    test: str  # "log-rank" of episodes, else "sign-flip"; none of the mean over environments
+    p_value: float  # two-sided; of the sign-flip test with n seeds never below 2 / 2ⁿ
     p_holm: float  # adjusted for all rows of the table, the more the stricter
     probability: float  # that a run of the variant is better than one of the baseline
     probability_low: float  # of its interval
     probability_high: float
 
 
+class Regret(NamedTuple):
+    """A row of regret.csv: what a variant loses against the best constant."""
+
+    env: str
+    variant: str
+    best_constant: str  # by the mean of `area_under_curve` over all seeds
+    best_area: float  # that mean
+    variant_area: float
+    regret: float  # (best - variant) / (best - random return); NaN if no constant beats random
+    low: float  # of its interval; NaN if in a resample no constant beats random
+    high: float
+    seeds: int
+
+
 def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of comparisons.csv from the frame of metrics.csv.
 
-    One `Comparison` per environment, metric and configured pair of variants that are both there.
+    One `Comparison` per environment, metric and configured pair of variants that are both there;
+    then one per metric and pair for all environments together, if there are several.
     """
+    groups = [[runs] for _, runs in table.groupby("env", sort=False)]
+    if len(groups) > 1:
+        groups.append([runs for (runs,) in groups])
     rows = [
-        _compare(runs, metric, pair, settings)
-        for _, runs in table.groupby("env", sort=False)
+        _compare(environments, metric, pair, settings)
+        for environments in groups
         for metric in all_metrics(settings)
         for pair in settings.comparisons
-        if set(pair) <= set(runs["variant"])
+        if set(pair) <= set(table["variant"])
     ]
-    p_values = [row.p_value for row in rows]
-    if not np.isnan(p_values).any():  # as with one seed
-        adjusted = holm(p_values)
-        rows = [row._replace(p_holm=p) for row, p in zip(rows, adjusted, strict=True)]
-    return pd.DataFrame(rows, columns=Comparison._fields)
+    frame = pd.DataFrame(rows, columns=Comparison._fields)
+    tested = frame["p_value"].notna()
+    frame.loc[tested, "p_holm"] = holm(frame.loc[tested, "p_value"].to_list())
+    return frame
 
 
 def _compare(
-    runs: pd.DataFrame, metric: Metric, pair: list[str], settings: MetricsConfig
+    environments: list[pd.DataFrame], metric: Metric, pair: list[str], settings: MetricsConfig
 ) -> Comparison:
-    """One row, but for `p_holm`, from the rows of metrics.csv of one environment."""
-    runs = runs[runs["variant"].isin(pair)]
-    wide = runs.pivot(index="seed", columns="variant", values=metric.name).astype(np.float64)
-    x, y = (wide[variant].to_numpy() for variant in pair)  # [seeds] each
-    sign = -1 if metric.unit == "episodes" else 1  # greater is better
+    """One row, but for `p_holm`, from the rows of metrics.csv of each environment.
+
+    All runs are censored at the same episode E. Restricted to E, the mean ∫₀ᴱ S(t) dt of Kaplan's
+    and Meier's estimate S is then the mean of the runs, with E for those that never got there.
+    """
     how = (settings.confidence, settings.bootstrap_repetitions)
     seed = settings.bootstrap_seed  # of a generator for each: no cell depends on another
-    difference = paired_comparison(x, y, *how, np.random.default_rng(seed))
-    better = probability_of_improvement(sign * x, sign * y, *how, np.random.default_rng(seed))
-    censored = int(runs[metric.flag].sum()) if metric.flag in runs else 0
-    environment = str(runs["env"].iloc[0])
-    return Comparison(
-        environment, metric.name, *pair, len(x), censored, *difference, np.nan, *better
+    runs = [frame[frame["variant"].isin(pair)] for frame in environments]
+    reached = [_reached(frame, metric, pair) for frame in runs]
+    restricted = [
+        [np.where(np.isinf(values), frame["episodes"].min(), values) for values in both]
+        for both, frame in zip(reached, runs, strict=True)
+    ]
+    sign = -1 if metric.unit == "episodes" else 1  # greater is better
+    better = probability_of_improvement(
+        [(sign * x, sign * y) for x, y in restricted], *how, np.random.default_rng(seed)
     )
+    censored = sum(int(np.isinf(values).sum()) for both in reached for values in both)
+    row = Comparison(
+        ALL, metric.name, *pair, len(reached[0][0]), censored, *UNTESTED, np.nan, *better
+    )
+    if len(runs) > 1:
+        return row
+    compared = paired_comparison(*restricted[0], *how, np.random.default_rng(seed))
+    row = row._replace(env=str(runs[0]["env"].iloc[0]), test="sign-flip", **compared._asdict())
+    if metric.unit == "episodes":
+        p_value = logrank(*reached[0], how[1], np.random.default_rng(seed))
+        row = row._replace(test="log-rank", p_value=p_value)
+    return row
+
+
+def _reached(runs: pd.DataFrame, metric: Metric, pair: list[str]) -> list[np.ndarray]:
+    """The metric's values of both variants, [seeds] each, in the order of the seeds.
+
+    Of episodes, np.inf if never reached in the budget that both have.
+    """
+    values = runs[metric.name].astype(np.float64)
+    if metric.unit == "episodes":
+        in_budget = values <= runs["episodes"].min()
+        values = values.where(in_budget & (runs[metric.flag] == 0), np.inf)
+    wide = runs.assign(value=values).pivot(index="seed", columns="variant", values="value")
+    return [wide[variant].to_numpy() for variant in pair]
+
+
+def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The data of regret.csv from the frame of metrics.csv, as `metrics.regret` configures it.
+
+    One `Regret` per environment and, of several, their mean. The interval is the bootstrap over
+    seeds, of all variants together, in which the best constant is chosen anew each time. The best
+    of several noisy means is on average better than the best of the true ones: the regret errs
+    upward, against the variant, and its interval with it.
+    """
+    variant, constants = settings.regret.variant, settings.regret.constants
+    areas, randoms, rows = [], [], []
+    for environment, runs in table.groupby("env", sort=False):
+        wide = runs.pivot(index="seed", columns="variant", values="area_under_curve")
+        areas.append(wide[[variant, *constants]].to_numpy())  # [seeds, 1 + constants]
+        randoms.append(settings.random_return_in(environment))
+        own, *others = areas[-1].mean(axis=0)
+        best = constants[int(np.argmax(others))], max(others), own
+        rows.append(
+            Regret(environment, variant, *best, *_regret(areas[-1:], randoms[-1:], settings))
+        )
+    if len(rows) > 1:
+        nothing = "", np.nan, np.nan
+        rows.append(Regret(ALL, variant, *nothing, *_regret(areas, randoms, settings)))
+    return pd.DataFrame(rows)
+
+
+def _regret(
+    areas: list[np.ndarray], randoms: list[float], settings: MetricsConfig
+) -> tuple[float, float, float, int]:
+    """Mean regret, its interval and the seeds, from [seeds, 1 + constants] of each environment."""
+    generator, seeds = np.random.default_rng(settings.bootstrap_seed), len(areas[0])
+    regrets = []  # of each environment: [repetitions + 1], the seeds as they are first
+    for area, random in zip(areas, randoms, strict=True):
+        drawn = generator.integers(seeds, size=(settings.bootstrap_repetitions, seeds))
+        means = area[np.vstack([np.arange(seeds), drawn])].mean(axis=1)
+        best = means[:, 1:].max(axis=1)
+        regrets.append((best - means[:, 0]) / np.where(best > random, best - random, np.nan))
+    mean, *resampled = np.mean(regrets, axis=0)
+    if seeds == 1:
+        return mean, np.nan, np.nan, seeds
+    return mean, *percentiles(np.array(resampled), settings.confidence), seeds

@@ -1,12 +1,9 @@
-"""What is measured on one run: how well it ends, and how soon it gets there.
+"""What is measured on one run: how well it ends, and how soon it gets there (docs/metrics.md).
 
 `METRICS` is the table of it, and columns, tables and comparisons follow it. A metric is a pure
 function of a `LearningCurve`; further ones, outside of this package, are added by the configuration
 (`metrics.custom`). An `Episode` metric that a run never attains is reported as E and flagged as
 censored, never dropped; E is then a lower bound.
-
-The paper's definitions ("Detail of Evaluation Metrics") are `final_return`, `sample_efficiency`
-and `convergence_steps`; Table 1 uses these. The others show what another reading changes.
 """
 
 import math
@@ -33,7 +30,7 @@ PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 
-COLUMN_TYPES = {"episodes": int, "return": float}  # of metrics.csv, by a metric's unit
+COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 
 class Episode(NamedTuple):
@@ -51,6 +48,21 @@ class LearningCurve:
     final: float  # `final_return` of these
     random_mean: float  # mean return of uniformly random actions in this environment
     settings: MetricsConfig
+    reference: float = math.nan  # `reference_return` and `solved_return` in this environment,
+    solved: float = math.nan  # where the study has them
+
+    @property
+    def learned(self) -> bool:
+        """Whether the run ends better than random actions, by more than two standard errors.
+
+        If not, a bar that depends on how it ends says nothing: 75 % of 0 is reached in episode 1.
+        """
+        last = last_part(self.returns, self.settings.final_fraction)
+        return bool(self.final - 2 * last.std() / math.sqrt(len(last)) > self.random_mean)
+
+    def bar(self, goal: float) -> float:
+        """The return threshold of the way from random actions to `goal`."""
+        return self.random_mean + self.settings.threshold * (goal - self.random_mean)
 
     def first(self, reached: np.ndarray, episode: int = 1) -> Episode:
         """The first true entry of `reached` [n], whose entry 0 belongs to episode `episode`."""
@@ -65,8 +77,9 @@ class Metric:
 
     name: str  # of its column in metrics.csv
     label: str  # in tables
-    unit: Literal["episodes", "return"]  # of episodes fewer are better, of return more
+    unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
     function: Callable[[LearningCurve], Episode | float]  # an Episode if the unit is episodes
+    needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
 
     @property
     def flag(self) -> str:
@@ -74,13 +87,18 @@ class Metric:
         return f"{self.name}_censored"
 
 
-def final_return(returns: np.ndarray, fraction: float) -> float:
-    """Mean return of the last `fraction` of the episodes (paper: the last 10 %).
+def last_part(returns: np.ndarray, fraction: float) -> np.ndarray:
+    """The last `fraction` of the episodes (paper: the last 10 %).
 
     Where that is no whole number of episodes it is rounded up: 15 episodes end with the last 2.
     """
     last = math.ceil(Fraction(repr(fraction)) * len(returns))  # 0.07 of 100 is 7, not 7.000…001
-    return float(np.mean(returns[-last:]))
+    return returns[-last:]
+
+
+def final_return(returns: np.ndarray, fraction: float) -> float:
+    """Mean return of `last_part`."""
+    return float(np.mean(last_part(returns, fraction)))
 
 
 def moving_average(values: np.ndarray, window: int) -> np.ndarray:
@@ -106,39 +124,54 @@ def sample_efficiency(curve: LearningCurve) -> Episode:
     """The first episode with a return ≥ threshold · final (paper, literally).
 
     A single lucky episode is enough. Where returns are negative the bar lies *above* the final
-    return (75 % of -85 is -63.75) and may never be reached.
+    return (75 % of -85 is -63.75) and may never be reached. Censored too, and this the paper does
+    not say: the run has not `learned`.
     """
-    return curve.first(curve.returns >= curve.settings.threshold * curve.final)
+    reached = curve.returns >= curve.settings.threshold * curve.final
+    return curve.first(reached & curve.learned)
 
 
 def convergence_steps(curve: LearningCurve) -> Episode:
     """The point where the slope of the moving average becomes minimal (paper).
 
-    Our reading: while the agent learns the average rises; training "yields diminishing returns"
-    where it stops to. So: the first episode after the steepest rise at which the slope is no longer
-    positive, its magnitude having come down to its minimum, 0. On a curve that rises and stays,
-    this is the first episode of smallest absolute slope after the rise. Searching the whole curve
-    for the smallest absolute slope instead finds the flat start of a run that has yet to learn, or
-    chance on the final plateau: `convergence_steps_flattest`.
+    Our reading: the first episode, once the average has come threshold of the way from random to
+    final, at which its slope is down to `convergence_slope` of the steepest so far. Of the readings
+    that tools/convergence_simulation.py compares it varies least between seeds.
 
-    Censored: the average never rises, is still rising at the end, or E < 2 windows.
+    Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
+    """
+    settings, window = curve.settings, curve.settings.moving_average
+    slopes = slope(curve.returns, window)
+    high = moving_average(curve.returns, window) >= curve.bar(curve.final)
+    learnt = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
+    minimal = slopes <= settings.convergence_slope * np.maximum.accumulate(slopes)
+    return curve.first(learnt & minimal & curve.learned, 2 * window)
+
+
+def convergence_steps_steepest(curve: LearningCurve) -> Episode:
+    """The first episode after the steepest rise at which the slope is no longer positive.
+
+    The steepest rise can be the recovery from a late collapse. Censored: the average never rises,
+    is still rising at the end, the run has not `learned`, or E < 2 windows.
     """
     window = curve.settings.moving_average
     slopes = slope(curve.returns, window)
     if not (slopes > 0).any():
         return Episode(len(curve.returns), True)
     steepest = int(np.argmax(slopes))  # the first of equals
-    return curve.first(slopes[steepest:] <= 0, 2 * window + steepest)
+    return curve.first((slopes[steepest:] <= 0) & curve.learned, 2 * window + steepest)
 
 
 def convergence_steps_flattest(curve: LearningCurve) -> Episode:
     """The first episode at which the absolute slope is smallest in all of training.
 
-    The most literal reading of the paper's sentence. Censored only if E < 2 windows.
+    The most literal reading of the paper's sentence: it finds the flat start of a run that has yet
+    to learn, or chance on the final plateau. Censored: the run has not `learned`, or E < 2 windows.
     """
     window = curve.settings.moving_average
     magnitude = np.abs(slope(curve.returns, window))
-    return curve.first(magnitude == magnitude.min(initial=np.inf), 2 * window)
+    flattest = magnitude == magnitude.min(initial=np.inf)
+    return curve.first(flattest & curve.learned, 2 * window)
 
 
 def convergence_steps_public_code(curve: LearningCurve) -> Episode:
@@ -153,30 +186,41 @@ def convergence_steps_public_code(curve: LearningCurve) -> Episode:
     return curve.first(flat, floor + 1)
 
 
+def sample_efficiency_common(curve: LearningCurve) -> Episode:
+    """The first episode whose moving average has come threshold of the way to the reference.
+
+    The bar is random + threshold · (reference - random), the same for every variant: ending worse
+    does not lower it. Censored: never reached.
+    """
+    return _average_reaches(curve, curve.reference)
+
+
 def sample_efficiency_range(curve: LearningCurve) -> Episode:
     """The first episode whose moving average has come threshold of the way from random to final.
 
     The bar is random + threshold · (final - random): it means the same for negative returns, and
-    one lucky episode does not reach it. Censored: never reached, or the run ends no better than
-    random.
+    one lucky episode does not reach it. Censored: the run has not `learned`.
     """
-    settings, gain = curve.settings, curve.final - curve.random_mean
-    average = moving_average(curve.returns, settings.moving_average)
-    reached = average >= curve.random_mean + settings.threshold * gain
-    return curve.first(reached & (gain > 0), settings.moving_average)
+    reached = _average_reaches(curve, curve.final)
+    return reached if curve.learned else Episode(len(curve.returns), True)
 
 
 def convergence_steps_range(curve: LearningCurve) -> Episode:
     """The first episode from which on the moving average stays near the final return.
 
     Near is within band · (final - random). Censored: the average ends outside that band, or the
-    run ends no better than random.
+    run has not `learned`.
     """
     settings, gain = curve.settings, curve.final - curve.random_mean
     average = moving_average(curve.returns, settings.moving_average)
     near = np.abs(average - curve.final) <= settings.convergence_band * gain
     settled = np.logical_and.accumulate(near[::-1])[::-1]
-    return curve.first(settled & (gain > 0), settings.moving_average)
+    return curve.first(settled & curve.learned, settings.moving_average)
+
+
+def solved(curve: LearningCurve) -> float:
+    """The share of the last episodes (`last_part`) whose return is at least `solved_return`."""
+    return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
 
 
 METRICS = (
@@ -186,10 +230,24 @@ METRICS = (
     Metric(  # under the learning curve, per episode
         "area_under_curve", "Mean return of training", "return", lambda curve: curve.returns.mean()
     ),
+    Metric("solved", "Solved at the end", "share", solved, "solved_return"),
+    Metric(
+        "sample_efficiency_common",
+        "Sample efficiency (common bar)",
+        "episodes",
+        sample_efficiency_common,
+        "reference_return",
+    ),
     Metric(
         "sample_efficiency_range", "Sample efficiency (range)", "episodes", sample_efficiency_range
     ),
     Metric("convergence_steps_range", "Convergence (range)", "episodes", convergence_steps_range),
+    Metric(
+        "convergence_steps_steepest",
+        "Convergence (steepest)",
+        "episodes",
+        convergence_steps_steepest,
+    ),
     Metric(
         "convergence_steps_flattest",
         "Convergence (flattest)",
@@ -206,8 +264,11 @@ METRICS = (
 
 
 def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
-    """`METRICS` and, after them, those of `metrics.custom`; `ConfigError` for what is no metric."""
-    metrics = list(METRICS)
+    """Those of `METRICS` whose settings are there and, after them, those of `metrics.custom`.
+
+    Raises `ConfigError` for what is no metric.
+    """
+    metrics = [one for one in METRICS if one.needs is None or getattr(settings, one.needs)]
     for reference in settings.custom:
         metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
         if not isinstance(metric, Metric):
@@ -217,7 +278,9 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
         elif {metric.name, metric.flag} & columns.keys():
             problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
         elif metric.unit not in COLUMN_TYPES:
-            problem = f"has the unit {metric.unit!r}, but should have {' or '.join(COLUMN_TYPES)}"
+            problem = (
+                f"has the unit {metric.unit!r}, but should have one of {', '.join(COLUMN_TYPES)}"
+            )
         else:
             metrics.append(metric)
             continue
@@ -239,16 +302,18 @@ def metrics_of_run(
     environment, variant, seed = run
     returns = frame["extrinsic_return"].to_numpy()
     final = final_return(returns, settings.final_fraction)
-    curve = LearningCurve(returns, final, settings.random_return_in(environment), settings)
+    random = settings.random_return_in(environment)
+    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
+    curve = LearningCurve(returns, final, random, settings, *goals)
     row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(returns)}
     row["env_steps"] = int(frame["env_steps"].iloc[-1])
     metrics = all_metrics(settings)
     for metric in metrics:
         value = metric.function(curve)
-        if metric.unit == "return" and isinstance(value, Real) and math.isfinite(value):
-            row[metric.name] = float(value)
-        elif metric.unit == "episodes" and isinstance(value, Episode):
+        if metric.unit == "episodes" and isinstance(value, Episode):
             row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
+        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
+            row[metric.name] = float(value)
         else:
             kind = "an Episode" if metric.unit == "episodes" else "a finite number"
             raise ConfigError(f"{metric.name} of {_name(run)} is {value!r}, but should be {kind}")
@@ -298,6 +363,12 @@ def read_metrics(
     _check_attained(str(path), table, metrics)
     _check_budgets(str(path), table)
     return table
+
+
+def _average_reaches(curve: LearningCurve, goal: float) -> Episode:
+    """The first episode whose moving average is at the bar for `goal`."""
+    window = curve.settings.moving_average
+    return curve.first(moving_average(curve.returns, window) >= curve.bar(goal), window)
 
 
 def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:

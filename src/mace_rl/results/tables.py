@@ -47,7 +47,7 @@ OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is na
     "normalise_observations": "Normalised Observations",
 }
 
-DIGITS = {"episodes": 0, "return": 1}  # after the point, by a metric's unit
+DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit
 COLUMNS_PER_BLOCK = 3  # environments, or variants, side by side; more continue below
 
 _LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
@@ -72,10 +72,10 @@ def summary(
     """The `metrics` averaged over seeds; `table` is the frame of metrics.csv.
 
     One row per environment, variant and metric, in the order of `table` and `metrics`: `mean`,
-    the bounds `low` and `high` of its interval (NaN with one seed; for a metric in episodes cut to
-    [1, E], where its mean must lie), the number of `seeds`, how many of them are `censored`
-    (counted with E, so the mean is a lower bound), the budget E in `episodes`, and the `paper`'s
-    value (missing where it has none).
+    the bounds `low` and `high` of its interval (NaN with one seed; cut to where its mean must lie,
+    [1, E] for a metric in episodes and [0, 1] for a share), the number of `seeds`, how many of them
+    are `censored` (counted with E, so the mean is a lower bound), the budget E in `episodes`, and
+    the `paper`'s value (missing where it has none).
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
@@ -88,8 +88,8 @@ def summary(
                 settings.bootstrap_repetitions,
                 np.random.default_rng(settings.bootstrap_seed),
             )
-            if metric.unit == "episodes":  # a mean of episodes lies among the episodes
-                low, high = np.clip((low, high), 1, runs["episodes"].iloc[0])
+            limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
+            low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
             rows.append(
                 {
                     "env": environment,
@@ -151,12 +151,10 @@ def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: Metri
             ["Algorithm", *map(latex, block)],
             [
                 [
-                    [
-                        r"\newline ".join(_label(variant, labels)),
-                        *(cell(name, variant) for name in block),
-                    ]
-                    for variant in variants
+                    r"\newline ".join(_label(variant, labels)),
+                    *(cell(name, variant) for name in block),
                 ]
+                for variant in variants
             ],
         )
         for block in _blocks(environments)
@@ -171,30 +169,28 @@ def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: Metri
 def supplement_latex(
     table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig
 ) -> str:
-    """The companion metrics from `supplement`: columns are variants, groups are environments."""
-    environments, variants = list(table["env"].unique()), list(table["variant"].unique())
+    """The companion metrics from `supplement`: a table per environment, its columns variants."""
     cells = _cells(table)
 
     def cell(environment: str, variant: str, metric: Metric) -> str:
         row, digits = cells[environment, variant, metric.name], DIGITS[metric.unit]
         return _stack(_mean(row, digits), rf"{{\scriptsize {_interval(row, digits)}}}")
 
-    blocks = [
-        _tabular(
-            ["", *(_stack(*_label(variant, labels)) for variant in block)],
-            [
+    floats = []
+    for environment, own in table.groupby("env", sort=False):
+        blocks = [
+            _tabular(
+                ["", *(_stack(*_label(variant, labels)) for variant in block)],
                 [
                     [latex(metric.label), *(cell(environment, name, metric) for name in block)]
                     for metric in companions(settings)
-                ]
-                for environment in environments
-            ],
-            environments,
-        )
-        for block in _blocks(variants)
-    ]
-    caption = "The companion metrics: returns, and in training episodes under other definitions. "
-    return _float(caption + _how(table, settings.confidence), "tab:supplement", blocks)
+                ],
+            )
+            for block in _blocks(list(table["variant"].unique()))
+        ]
+        caption = f"{latex(environment)}, the companion metrics. {_how(own, settings.confidence)}"
+        floats.append(_float(caption, f"tab:supplement:{environment}", blocks))
+    return "\n".join(floats)
 
 
 def table2_latex(ppo: Mapping[str, PPOConfig]) -> str:
@@ -254,25 +250,19 @@ def _blocks(names: Sequence[str]) -> list[Sequence[str]]:
     return [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
 
 
-def _tabular(
-    head: Sequence[str], groups: Sequence[Sequence[Sequence[str]]], titles: Sequence[str] = ()
-) -> str:
-    """A tabular of \\textwidth: a head, then groups of rows of cells, each group with its title."""
+def _tabular(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A tabular of \\textwidth: a head and rows of cells."""
     columns = r"p{0.23\textwidth}" + "c" * (len(head) - 1)
     lines = [
         rf"\begin{{tabular*}}{{\textwidth}}{{@{{\extracolsep{{\fill}}}}{columns}@{{}}}}",
         r"\toprule",
         " & ".join(head) + r" \\",
+        r"\midrule",
+        "\n\\addlinespace\n".join(rf"\raggedright {' & '.join(row)} \\" for row in rows),
+        r"\bottomrule",
+        r"\end{tabular*}",
     ]
-    for number, rows in enumerate(groups):
-        lines.append(r"\midrule")
-        if titles:
-            title = rf"\textit{{{latex(titles[number])}}}"
-            lines.append(rf"\multicolumn{{{len(head)}}}{{@{{}}l}}{{{title}}} \\")
-            lines.append(r"\addlinespace")
-        printed = [rf"\raggedright {' & '.join(row)} \\" for row in rows]
-        lines.append("\n\\addlinespace\n".join(printed))
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular*}"])
+    return "\n".join(lines)
 
 
 def _stack(*lines: str) -> str:

@@ -1,0 +1,78 @@
+"""Running scales, which make rewards and advantages of different tasks comparable."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mace_rl.agent.normaliser import RunningNormaliser
+
+
+class RewardScale:
+    """What rewards are divided by: the standard deviation of their discounted sums so far.
+
+    The sum at a step is r_t + γ r_{t-1} + γ² r_{t-2} + … within its episode (as in the code of
+    Schulman et al. 2017; Engstrom et al. 2020), and the scale is never below `smallest`.
+    """
+
+    def __init__(self, discount: float, smallest: float) -> None:
+        self.discount, self.smallest = discount, smallest
+        self.sums = RunningNormaliser(1)
+
+    def update(self, rewards: np.ndarray) -> None:
+        """Take in one episode's rewards, [T]."""
+        self.sums.update(discounted_sums(rewards, self.discount)[:, None])
+
+    @property
+    def value(self) -> float:
+        """The scale; at least `smallest`."""
+        return max(float(self.sums.std[0]), self.smallest)  # 1 while the sums have not varied
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+        return self.sums.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.sums.load_state_dict(state)
+
+
+class AdvantageScale:
+    """What advantages are divided by: their root mean square so far, at least `smallest`.
+
+    It comes down slowly when advantages do, so that what fades in a task fades here.
+    """
+
+    def __init__(self, smallest: float) -> None:
+        self.smallest = smallest
+        self.count, self.squares = 0, 0.0
+
+    def update(self, advantages: np.ndarray) -> None:
+        """Take in one episode's advantages, [T]."""
+        self.count += len(advantages)
+        self.squares += float(advantages @ advantages)
+
+    @property
+    def value(self) -> float:
+        """The scale; at least `smallest`."""
+        return max(math.sqrt(self.squares / max(self.count, 1)), self.smallest)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs."""
+        return {"count": self.count, "squares": self.squares}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.count, self.squares = state["count"], state["squares"]
+
+
+@njit(cache=True)
+def discounted_sums(rewards, discount):
+    """r_t + γ r_{t-1} + γ² r_{t-2} + … at each step of an episode, float64 [T]."""
+    result = np.empty(len(rewards))
+    total = 0.0
+    for t in range(len(rewards)):
+        total = discount * total + rewards[t]
+        result[t] = total
+    return result

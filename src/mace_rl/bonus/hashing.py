@@ -1,0 +1,83 @@
+"""Counts of hashed states (Tang et al. 2017), a pseudo-count (Bellemare et al. 2016)."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
+from mace_rl.config.run import HashCountsBonus
+from mace_rl.environments.rollout import Episode
+
+
+class HashCounts(IntrinsicReward):
+    """1 / √n(φ(s')) with φ(s) = sign(A g(s)), SimHash, in `bits` bits (section 2.2, algorithm 1).
+
+    A is a fixed Gaussian matrix, so that states at a small angle share most bits. n counts this
+    visit and those earlier in the episode too: a first visit earns 1.
+
+    g whitens by the mean and standard deviation of the first `calibration_states` visited states:
+    the angle would otherwise be that of the dimension with the largest numbers. While these are
+    collected, all visits are counted anew after each episode; then φ stays. Discrete states are
+    one-hot and stay as they are.
+    """
+
+    largest = 1.0
+
+    def __init__(
+        self,
+        config: HashCountsBonus,
+        observation_space: Box | Discrete,
+        observation_size: int,
+        generator: np.random.Generator,
+    ) -> None:
+        self.config = config
+        self.matrix = generator.standard_normal((config.bits, observation_size))  # A
+        self.normaliser = RunningNormaliser(observation_size)
+        self.discrete = isinstance(observation_space, Discrete)
+        self.early = np.empty((0, observation_size), np.float32)  # what g was calibrated on
+        self.counts: Counter[int] = Counter()
+
+    def codes(self, states: np.ndarray) -> list[int]:
+        """φ of each state, [T, observation], as a number whose bits are the signs."""
+        signs = self.normaliser(states) @ self.matrix.T > 0
+        return (signs @ (1 << np.arange(self.config.bits))).tolist()
+
+    def bonus(self, episode: Episode) -> Bonus:
+        """See `IntrinsicReward`."""
+        visits: Counter[int] = Counter()  # of this episode
+        reward = np.empty(len(episode))
+        for t, code in enumerate(self.codes(episode.observations[1:])):
+            visits[code] += 1
+            reward[t] = (self.counts[code] + visits[code]) ** -0.5
+        return Bonus(reward)
+
+    def remember(self, episode: Episode, returns: np.ndarray) -> None:
+        """See `IntrinsicReward`; the returns do not matter."""
+        states = episode.observations[1:]
+        if not self.discrete and len(self.early) < self.config.calibration_states:
+            self.normaliser.update(states)
+            self.early = states = np.concatenate([self.early, states])
+            self.counts.clear()
+        self.counts.update(self.codes(states))
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `IntrinsicReward`."""
+        return {
+            "matrix": torch.from_numpy(self.matrix.copy()),
+            "normaliser": self.normaliser.state_dict(),
+            "early": torch.from_numpy(self.early.copy()),
+            "codes": torch.tensor(list(self.counts), dtype=torch.int64),
+            "counts": torch.tensor(list(self.counts.values()), dtype=torch.int64),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `IntrinsicReward`."""
+        self.matrix = state["matrix"].numpy().copy()
+        self.normaliser.load_state_dict(state["normaliser"])
+        self.early = state["early"].numpy().copy()
+        counts = zip(state["codes"].tolist(), state["counts"].tolist(), strict=True)
+        self.counts = Counter(dict(counts))

@@ -1,0 +1,174 @@
+"""Exploration tasks: environments in which random actions hardly ever see a reward.
+
+    id                              return of solving it; what makes it hard
+    SparseMountainCar-v0            1; the reward comes at the goal only
+    DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
+    FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
+    CliffWalking200-v0              -13; what random actions find is the cliff, at -100 a fall
+    SparseHopper-v0                 1 for every 0.5 m; falling forward does not get that far
+    BarrenRegion-v0                 1; novelty without end lies elsewhere
+
+Whatever an environment remembers beside its generator is of the current episode.
+"""
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.classic_control import MountainCarEnv
+from gymnasium.spaces import Box, Discrete
+
+
+class SparseMountainCar(MountainCarEnv):
+    """Gymnasium's MountainCar-v0 with reward 1 for reaching the goal and 0 until then."""
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Gymnasium's step, under another reward."""
+        state, _, terminated, truncated, info = super().step(action)
+        return state, float(terminated), terminated, truncated, info
+
+
+class DeepSea(gymnasium.Env):
+    """Deep Sea (Osband et al. 2020, bsuite), deterministic: `size` × `size` cells, start top left.
+
+    Every step leads one row down, and one column left or right as far as there is one. Right costs
+    0.01 / `size`; right in the last column, which only right all the way leads to, gives 1 as well.
+    The returns are thus 0.99 or at most 0. Which action is right is drawn for every cell, from
+    bsuite's seed: one fixed task, the same as bsuite's for every seed of the environment.
+
+    Observation: the number of the cell, row by row; `size`² after the last step.
+    """
+
+    MAPPING_SEED = 42  # of every deep sea in bsuite's sweep
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.observation_space = Discrete(size * size + 1)
+        self.action_space = Discrete(2)
+        # The generator that bsuite has, whose numbers numpy keeps as they are for good.
+        mapping = np.random.RandomState(self.MAPPING_SEED).binomial(1, 0.5, (size, size))
+        self.right: list[int] = mapping.ravel().tolist()  # the action, for each cell
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """To the top left."""
+        super().reset(seed=seed)
+        self.row = self.column = 0
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """One row down."""
+        reward = 0.0
+        if action == self.right[self.row * self.size + self.column]:
+            reward = float(self.column == self.size - 1) - 0.01 / self.size
+            self.column = min(self.column + 1, self.size - 1)
+        else:
+            self.column = max(self.column - 1, 0)
+        self.row += 1
+        bottom = self.row == self.size
+        cell = self.size * self.size if bottom else self.row * self.size + self.column
+        return cell, reward, bottom, False, {}
+
+
+class MetresPassed(gymnasium.Wrapper):
+    """Reward 1 each time the torso has come another `distance` metres forward, otherwise 0.
+
+    For a locomotion environment of Bullet's. The farthest point of the episode counts, so going
+    back and forth earns nothing. How far it is to the next reward is not in the observation.
+    """
+
+    def __init__(self, env: gymnasium.Env, distance: float) -> None:
+        super().__init__(env)
+        self.distance = distance
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """The environment's reset; the way counts from there."""
+        result = self.env.reset(seed=seed, options=options)
+        self.start, self.passed = self._x(), 0
+        return result
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """The environment's step, under another reward."""
+        state, _, terminated, truncated, info = self.env.step(action)
+        before = self.passed
+        self.passed = max(before, int((self._x() - self.start) / self.distance))
+        return state, float(self.passed - before), terminated, truncated, info
+
+    def _x(self) -> float:
+        """Where the torso is on the way forward, in metres."""
+        return float(self.unwrapped.robot.body_real_xyz[0])
+
+
+class BarrenRegion(gymnasium.Env):
+    """Corridors that lead to the reward, and a room full of news that never does.
+
+    From the start S it is one step east to the room (~), and nine west to a gate (^) that pays 0.1
+    and lets nobody back; behind it the goal (G) pays 0.9 and ends the episode. Actions 0 to 3 go
+    north, east, south and west, or nowhere if there is a wall (#). In the room the observation has
+    a screen with new random numbers every step; elsewhere its `screen` numbers are 0.
+
+    - PPO sees nothing in the room and strays through the corridors until it meets the gate.
+    - Novelty alone stays in the room: the screen never shows the same twice.
+    - With novelty × relevance the room is new at first too. But its states are alike enough to be
+      recognised (two numbers, not an image) and have never led anywhere, while those at the gate
+      have: the room's share of the bonus should vanish and that of the corridors remain.
+
+    `screen=0` is the control: the same room without news, where novelty alone should do well.
+
+    Observation: east and north of the map's middle, each from -1 to 1; then the screen, uniform in
+    [-1, 1]; float32 [2 + screen].
+    """
+
+    MAP = (
+        "#####....G#~~~~",
+        "#####.#####~~~~",
+        "......#####~~~~",
+        "^##########~~~~",
+        ".........S.~~~~",
+    )
+    REWARD: ClassVar = {"^": 0.1, "G": 0.9}
+    MOVES = ((-1, 0), (0, 1), (1, 0), (0, -1))  # in rows and columns
+
+    def __init__(self, screen: int = 2) -> None:
+        places = [(i, j) for i, row in enumerate(self.MAP) for j, c in enumerate(row) if c != "#"]
+        self.kinds = [self.MAP[i][j] for i, j in places]
+        last_row, last_column = len(self.MAP) - 1, len(self.MAP[0]) - 1
+        self.coordinates = [(2 * j / last_column - 1, 1 - 2 * i / last_row) for i, j in places]
+        number = {place: n for n, place in enumerate(places)}
+        self.next = [  # cell, for each cell and action
+            [number.get((i + down, j + right), n) for down, right in self.MOVES]
+            for n, (i, j) in enumerate(places)
+        ]
+        for n, neighbours in enumerate(self.next):  # through the gate one goes north only
+            for action, neighbour in enumerate(neighbours):
+                north = action == 0
+                if not north and "^" in (self.kinds[n], self.kinds[neighbour]):
+                    neighbours[action] = n
+        self.screen = screen
+        self.observation_space = Box(-1, 1, (2 + screen,), np.float32)
+        self.action_space = Discrete(len(self.MOVES))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """To the start."""
+        super().reset(seed=seed)
+        self.cell = self.kinds.index("S")
+        return self._observe(), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One cell on, or none."""
+        before, self.cell = self.cell, self.next[self.cell][action]
+        kind = self.kinds[self.cell]
+        reward = self.REWARD.get(kind, 0.0) if self.cell != before else 0.0
+        return self._observe(), reward, kind == "G", False, {}
+
+    def _observe(self) -> np.ndarray:
+        observation = np.zeros(2 + self.screen, np.float32)
+        observation[:2] = self.coordinates[self.cell]
+        if self.kinds[self.cell] == "~":
+            observation[2:] = self.np_random.uniform(-1, 1, self.screen)
+        return observation

@@ -1,0 +1,329 @@
+"""The bonuses besides the paper's: what each one's own paper promises, and what all share."""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+from shared import ENGINES, Twin, finish
+from torch.nn.functional import cross_entropy
+
+from mace_rl.bonus.hashing import HashCounts
+from mace_rl.bonus.icm import IntrinsicCuriosityModule
+from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
+from mace_rl.bonus.rnd import RandomNetworkDistillation
+from mace_rl.config.reading import merge_layers
+from mace_rl.config.run import HashCountsBonus, ICMBonus, RNDBonus, RunConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.config.study import Study, read_study
+from mace_rl.environments.rollout import Episode
+from mace_rl.finite import NonFiniteError
+from mace_rl.runs.checkpoint import archive, unarchive
+from mace_rl.train import Trainer
+
+CONFIG = Path(__file__).parents[1] / "config.yaml"
+OTHERS = ["icm", "rnd", "hash_counts"]
+SIZE, ACTIONS = 5, {"discrete": Discrete(3), "box": Box(-1, 1, (2,), np.float32)}
+ZERO = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
+
+
+def wander(seed, centre=0.0, scale=1.0, length=50, size=SIZE, actions="discrete") -> Episode:
+    rng = np.random.default_rng(seed)
+    states = centre + scale * rng.standard_normal((length + 1, size))
+    taken = rng.integers(3, size=length) if actions == "discrete" else rng.normal(size=(length, 2))
+    zeros = np.zeros(length)
+    return Episode(states.astype(np.float32), taken, zeros.astype(np.float32), zeros, False)
+
+
+def make(kind: str, seed=0, engine="compiled", actions="discrete", **settings) -> IntrinsicReward:
+    space, generator = Box(-9, 9, (SIZE,)), np.random.default_rng(seed)
+    if kind == "icm":
+        config = ICMBonus(kind=kind, **settings)
+        return IntrinsicCuriosityModule(config, space, ACTIONS[actions], SIZE, generator)
+    if kind == "rnd":
+        config = RNDBonus(kind=kind, **settings)
+        return RandomNetworkDistillation(config, engine, space, SIZE, generator)
+    return HashCounts(HashCountsBonus(kind=kind, **settings), space, SIZE, generator)
+
+
+@pytest.fixture
+def with_bonus(study: Study):
+    """`with_bonus(bonus, environment, **changes)`: a run of mace_fixed with that bonus."""
+
+    def build(bonus: dict, environment="CartPole-v1", variant="mace_fixed", **changes) -> RunConfig:
+        settings = study.run_config(environment, variant, 3).settings()
+        return check(RunConfig, merge_layers(settings, {"bonus": bonus, **changes}), "the test")
+
+    return build
+
+
+# --- RND ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rnd_falls_where_it_was_and_stays_high_elsewhere(engine):
+    rnd, near, far = make("rnd", engine=engine), wander(99), wander(98, centre=4.0)
+    target = rnd.target.parameters.copy()
+    means = []
+    for seed in range(150):
+        rnd.remember(wander(seed), np.zeros(50))
+        means.append((rnd.bonus(near).reward.mean(), rnd.bonus(far).reward.mean()))
+    assert means[19][0] < 0.7 * means[0][0] and means[-1][0] < 0.05 * means[19][0]
+    assert means[-1][1] > 20 * means[-1][0]
+    assert (rnd.target.parameters == target).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rnd_by_autograd(engine):
+    """The bonus and the gradient, from the two networks as torch modules in float64."""
+    rnd = make("rnd", engine=engine)
+    for seed in range(3):
+        rnd.remember(wander(seed, scale=[1, 2, 3, 4, 50]), np.zeros(50))
+    states = np.concatenate([wander(s, scale=[1, 2, 3, 4, 50]).observations[1:] for s in range(3)])
+    episode = wander(7, scale=20.0)
+    seen = (episode.observations[1:] - states.mean(0)) / states.std(0)
+    seen = np.clip(seen, -5, 5)
+    predictor = Twin(rnd.network)
+    errors = (predictor(seen) - Twin(rnd.target)(seen).detach()).square().mean(dim=1)
+    np.testing.assert_allclose(rnd.bonus(episode).reward, errors.detach(), rtol=1e-3, atol=1e-5)
+    found, expected = rnd.gradient(seen.astype(np.float32)), predictor.gradient(errors.mean())
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+# --- ICM ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("actions", ACTIONS)
+def test_icm_by_autograd(actions):
+    """Its joint loss (equation 7) written out from its three networks, in float64."""
+    icm = make("icm", actions=actions, forward_weight=0.3, scale=4.0)
+    episode = wander(1, actions=actions)
+    parts = copy.deepcopy(icm.network.module()).double()
+    seen = torch.from_numpy(np.clip(episode.observations, -5, 5)).double()
+    before, after = parts.features(seen[:-1]), parts.features(seen[1:])
+    guess = parts.inverse_model(torch.cat([before, after], 1))
+    if actions == "discrete":
+        taken = torch.eye(3, dtype=torch.float64)[episode.actions]
+        inverse = cross_entropy(guess, torch.from_numpy(episode.actions))
+    else:  # as the environment took it: within its bounds
+        taken = torch.from_numpy(episode.actions.clip(-1, 1))
+        inverse = ((guess - taken) ** 2).sum() / 2 / len(taken)
+    errors = ((parts.forward_model(torch.cat([before, taken], 1)) - after) ** 2).sum(1) / 2
+    np.testing.assert_allclose(icm.bonus(episode).reward, 4 * errors.detach(), rtol=1e-4)
+    loss = 0.7 * inverse + 0.3 * errors.mean()
+    expected = torch.autograd.grad(loss, list(parts.parameters()))
+    expected = np.concatenate([gradient.numpy().ravel() for gradient in expected])
+    found = icm.gradient(icm.inputs(episode))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def walk(seed, length=100) -> Episode:
+    """A place that actions 0 and 1 move, and four dimensions of noise that nothing can."""
+    episode = wander(seed, length=length)
+    episode.actions[:] = np.random.default_rng(seed).integers(2, size=length)
+    places = episode.observations[:, 0]
+    places[0] = 0
+    for t, action in enumerate(episode.actions):
+        places[t + 1] = np.clip(places[t] + action - 0.5, -2, 2)
+    return episode
+
+
+def test_icm_learns_the_actions_and_leaves_out_what_they_do_not_influence():
+    """Even a perfect forward model of the observations misses the noise, 4/5 of their variance."""
+    icm = make("icm", feature_units=8)
+    for seed in range(100):
+        icm.remember(walk(seed), np.zeros(100))
+    held_out = icm.inputs(walk(1000, 1000))
+    inverse, forward = icm.network.forward(held_out).outputs.mean(axis=0)
+    features = icm.network.module().features(torch.from_numpy(held_out[:, SIZE : 2 * SIZE]))
+    assert inverse < 0.2 * math.log(2)  # nats; guessing costs log 2
+    assert 2 * forward < 0.1 * features.detach().numpy().var(axis=0).sum()
+
+
+# --- Counts of hashes ---------------------------------------------------------------------------
+
+
+def test_counts_are_those_of_sign_patterns():
+    """Counted by a dictionary of all that was seen, in units of the first 120 states or more."""
+    hashed = make("hash_counts", bits=4, calibration_states=120)
+    seen: list[np.ndarray] = []
+    for seed in range(6):
+        episode = wander(seed, centre=seed, scale=[1, 1, 5, 1, 100])
+        first = np.concatenate(seen[:3]) if seen else np.zeros((1, SIZE))  # 3 · 50 ≥ 120
+        mean, std = (first.mean(0), first.std(0)) if seen else (0.0, 1.0)
+        counts: dict[tuple, int] = {}
+
+        def visit(state, counts=counts, mean=mean, std=std) -> int:
+            pattern = tuple(row @ ((state - mean) / std) > 0 for row in hashed.matrix)
+            counts[pattern] = counts.get(pattern, 0) + 1
+            return counts[pattern]
+
+        for state in np.concatenate(seen) if seen else ():
+            visit(state)
+        expected = [1 / math.sqrt(visit(state)) for state in episode.observations[1:]]
+        np.testing.assert_allclose(hashed.bonus(episode).reward, expected)
+        hashed.remember(episode, np.zeros(50))
+        seen.append(episode.observations[1:].astype(np.float64))
+    assert sum(hashed.counts.values()) == 300
+
+
+def test_states_at_a_small_angle_share_a_code():
+    """Each bit differs with probability angle / π (Charikar 2002)."""
+    hashes = [make("hash_counts", seed, bits=62) for seed in range(100)]
+    one, other = np.eye(SIZE)[:2]
+    for angle, fewest, most in ((0.02, 40, 90), (0.5, 0, 1), (2.0, 0, 0)):
+        pair = np.float32([one, math.cos(angle) * one + math.sin(angle) * other])
+        codes = [hashed.codes(pair) for hashed in hashes]
+        differing = sum((first ^ second).bit_count() for first, second in codes)
+        assert differing / 6200 == pytest.approx(angle / math.pi, abs=0.02)
+        assert fewest <= sum(first == second for first, second in codes) <= most
+
+
+def test_discrete_states_are_counted_one_by_one(with_bonus):
+    trainer = finish(with_bonus({"kind": "hash_counts", "bits": 40}, "FrozenLake-v1", episodes=9))
+    assert set(trainer.curiosity.codes(np.eye(16))) >= set(trainer.curiosity.counts)
+    assert len(set(trainer.curiosity.codes(np.eye(16)))) == 16
+    assert trainer.curiosity.normaliser.count == 0  # one-hot states as they are
+    assert sum(trainer.curiosity.counts.values()) == trainer.records[-1].env_steps
+
+
+# --- What all share -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_restored_bonus_continues_to_the_bit(kind):
+    original, restored = make(kind), make(kind, seed=1)
+    for seed in range(3):
+        original.remember(wander(seed), np.zeros(50))
+    restored.load_state_dict(unarchive(archive(original.state_dict()), Path("memory")))
+    for seed in range(3, 6):
+        assert (original.bonus(wander(seed)).reward == restored.bonus(wander(seed)).reward).all()
+        original.remember(wander(seed), np.zeros(50))
+        restored.remember(wander(seed), np.zeros(50))
+    assert archive(original.state_dict()) == archive(restored.state_dict())
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
+def test_training(with_bonus, environment, engine, kind):
+    changes = {"episodes": 4, "engine": engine, "max_episode_steps": 60}
+    config = with_bonus({"kind": kind}, environment, **changes)
+    assert config.memory is config.novelty is None
+    trainer = finish(config)
+    assert all(0 < record.intrinsic_return < math.inf for record in trainer.records)
+    last = trainer.diagnostics[-1]
+    assert np.isnan([last.novelty, last.relevance, last.similarity]).all() and last.bonus_share > 0
+    interrupted, resumed = Trainer(config), Trainer(config)
+    next(interrupted.run())
+    resumed.load_state_dict(interrupted.state_dict())
+    assert archive(finish(resumed).state_dict()) == archive(trainer.state_dict())
+
+
+@pytest.mark.parametrize("bonus", [*OTHERS, "novelty alone"])
+@pytest.mark.parametrize("environment", ["CartPole-v1", "FrozenLake-v1", "Pendulum-v1"])
+def test_beta_0_equals_ppo_to_the_bit(with_bonus, study, environment, bonus):
+    changes = {"episodes": 6, "max_episode_steps": 60, "ppo": {"rollout_steps": 70}}
+    settings = {"kind": bonus} if bonus in OTHERS else {"kind": "curiosity", "relevance": False}
+    zero = finish(with_bonus(settings, environment, beta=ZERO, **changes))
+    plain = finish(with_bonus({}, environment, "ppo", **changes))
+    for name in ("actor", "extrinsic"):
+        states = [archive(run.ppo.optimisers[name].state_dict()) for run in (zero, plain)]
+        assert states[0] == states[1]
+    returns = [[record.extrinsic_return for record in run.records] for run in (zero, plain)]
+    assert returns[0] == returns[1] and plain.curiosity is None
+    assert sum(record.intrinsic_return for record in zero.records) > 0.1
+
+
+def test_without_relevance_the_bonus_is_novelty(with_bonus, monkeypatch):
+    trainer = Trainer(with_bonus({"kind": "curiosity", "relevance": False}, episodes=20))
+    assert trainer.config.memory is None and trainer.config.novelty is not None
+    bonuses, appraise = [], trainer.appraise
+    monkeypatch.setattr(
+        trainer, "appraise", lambda e: (bonuses.append((item := appraise(e)).bonus), item)[1]
+    )
+    finish(trainer)
+    for bonus in bonuses:
+        assert (bonus.reward == bonus.novelty).all() and (bonus.relevance == 1).all()
+    assert len(bonuses) == 20 and min(bonus.reward.min() for bonus in bonuses) < 0.9
+
+
+class Fixed(IntrinsicReward):
+    """A user's own: the number of actions at every step."""
+
+    def __init__(self, size, action_space, generator):
+        self.value = float(action_space.n)
+
+    def bonus(self, episode):
+        return Bonus(np.full(len(episode), self.value))
+
+    def remember(self, episode, returns):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+def test_a_bonus_of_one_s_own(with_bonus):
+    config = with_bonus({"kind": "custom", "estimator": "test_bonuses:Fixed"}, episodes=3)
+    trainer = finish(config)
+    assert all(r.intrinsic_return == 2 * r.length for r in trainer.records)
+    assert config.references() == {"bonus.estimator": "test_bonuses:Fixed"}
+    for value, text in ((-0.5, r"is -0.5, which is not in \[0, inf\]"), (math.inf, "is inf")):
+        trainer = Trainer(config)
+        trainer.curiosity.value = value
+        with pytest.raises(NonFiniteError, match=f"episode 1: the curiosity bonus {text}"):
+            finish(trainer)
+
+
+# --- The settings -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bonus", "fragment"),
+    [
+        ("{kind: rnb}", "in variant_settings.x, bonus is {'kind': 'rnb'}, but"),
+        ("{kind: rnd, feature_unit: 3}", "unknown key 'bonus.feature_unit' (value 3); the nearest"),
+        ("{kind: rnd, relevance: true}", "unknown key 'bonus.relevance'"),
+        ("{kind: icm, forward_weight: 1.5}", "bonus.forward_weight is 1.5, but should be less"),
+        ("{kind: hash_counts, bits: 63}", "bonus.bits is 63, but should be less than or equal"),
+        ("{kind: curiosity, relevance: 1}", "bonus.relevance is 1, but should be a valid boolean"),
+        ("{kind: custom}", "the key 'bonus.estimator' is missing"),
+        ("{kind: custom, estimator: 'no_such:Thing'}", "bonus.estimator has 'no_such:Thing'"),
+        ("null", "the section 'bonus' is missing"),
+        ("{kind: rnd}, memory: {capacity: 9}", "'memory', which a variant with bonus.kind 'rnd'"),
+        (
+            "{kind: curiosity, relevance: false}, memory: {capacity: 9}",
+            "variant_settings.x has the section 'memory', which a variant with bonus.relevance",
+        ),
+    ],
+)
+def test_mistake_is_named_in_one_line(tmp_path, bonus, fragment):
+    beta = "{kind: exponential, initial: 0.4, decay: 0.9, floor: 0.1}"
+    file = tmp_path / "over.yaml"
+    file.write_text(f"variant_settings: {{x: {{beta: {beta}, bonus: {bonus}}}}}\n")
+    with pytest.raises(ConfigError) as caught:
+        read_study([CONFIG, file])
+    assert fragment in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
+    """Of the same kind it changes some keys; of another it leaves nothing of it."""
+    bonuses = (CONFIG.parent / "config" / "bonuses.yaml").read_text()
+    file = tmp_path / "over.yaml"
+    file.write_text(
+        bonuses.replace("{kind: icm}", "{kind: icm, scale: 2.0}")
+        + "training: {bonus: {kind: icm, hidden_units: 7}}\n"
+    )
+    study = read_study([CONFIG, file])
+    bonuses = {v: study.run_config("CartPole-v1", v, 0).bonus for v in study.variants}
+    assert bonuses["ppo"] is None
+    assert bonuses["icm"] == ICMBonus(kind="icm", hidden_units=7, scale=2.0)
+    assert bonuses["rnd"] == RNDBonus(kind="rnd")
+    assert bonuses["mace_fixed"] == ICMBonus(kind="icm", hidden_units=7)

@@ -1,0 +1,207 @@
+"""NEC's dictionary as a critic: against loops over its entries, and what it promises."""
+
+import copy
+import io
+
+import numpy as np
+import pytest
+import torch
+from shared import environment_of, finish
+
+from mace_rl import train
+from mace_rl.agent.ppo import PPO, Batch
+from mace_rl.config.section import ConfigError
+from mace_rl.runs import run
+from mace_rl.runs.agent import Agent, load_agent
+from mace_rl.runs.checkpoint import archive
+from mace_rl.streams import Streams
+from mace_rl.train import Trainer
+
+DICTIONARY = {"kind": "dictionary", "capacity": 2000, "neighbours": 10}
+DICTIONARY |= {"kernel_bandwidth": 0.05, "learning_rate": 0.1}
+
+
+@pytest.fixture
+def make_ppo(run_config):
+    """`make_ppo(critic, **settings of ppo)`: CartPole's, with both critics."""
+
+    def make(critic=DICTIONARY, **settings) -> PPO:
+        settings = {"normalise_observations": False, "critic": critic} | settings
+        config = run_config("CartPole-v1", "ppo", 0, ppo=settings)
+        return train.ppo(config, environment_of("CartPole-v1"), True, Streams(0))
+
+    return make
+
+
+def batch_of(observations: np.ndarray, returns: np.ndarray) -> Batch:
+    """Steps with these returns, extrinsic and intrinsic ones."""
+    count = len(observations)
+    rng = np.random.default_rng(0)
+    return Batch(
+        observations=observations.astype(np.float32),
+        actions=rng.integers(2, size=count),
+        log_probs=np.full(count, np.log(0.5), np.float32),
+        advantages=rng.standard_normal(count).astype(np.float32),
+        returns=dict.fromkeys(("extrinsic", "intrinsic"), np.asarray(returns, np.float32)),
+    )
+
+
+class Slow:
+    """The dictionary as NEC's paper says it, entry by entry: [state, return, last use]."""
+
+    def __init__(self, capacity, neighbours, kernel_bandwidth, learning_rate, normaliser):
+        self.capacity, self.k = capacity, neighbours
+        self.delta, self.alpha = kernel_bandwidth, learning_rate
+        self.normaliser, self.entries, self.time = normaliser, [], 0
+
+    def value(self, state):
+        def distance(entry):
+            return np.mean(((entry[0] - state) / self.normaliser.std) ** 2)
+
+        chosen = sorted(self.entries, key=distance)[: self.k]
+        for entry in chosen:
+            entry[2] = self.time
+        kernels = [1 / (distance(entry) + self.delta) for entry in chosen]
+        return sum(k * e[1] for k, e in zip(kernels, chosen, strict=True)) / sum(kernels)
+
+    def values(self, states):
+        self.time += 1
+        return [self.value(state) for state in states]
+
+    def remember(self, states, returns):
+        self.time += 1
+        new = []
+        for state, target in zip(states, returns, strict=True):
+            for entry in self.entries + new:
+                if (entry[0] == state).all():
+                    entry[1:] = [entry[1] + self.alpha * (target - entry[1]), self.time]
+                    break
+            else:
+                new.append([state, target, self.time])
+        for entry in new:
+            if len(self.entries) < self.capacity:
+                self.entries.append(entry)
+            else:
+                uses = [entry[2] for entry in self.entries]
+                self.entries[uses.index(min(uses))] = entry
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+@pytest.mark.parametrize("capacity", [12, 50])
+def test_values_equal_a_search_entry_by_entry(make_ppo, monkeypatch, capacity, normalise):
+    """States that come again, capacity that does not last, a standardisation that moves."""
+    settings = {"capacity": capacity, "neighbours": 4, "kernel_bandwidth": 0.1}
+    settings["learning_rate"] = 0.3
+    ppo = make_ppo(DICTIONARY | settings, normalise_observations=normalise)
+    critic, slow = ppo.critics["intrinsic"], Slow(**settings, normaliser=ppo.normaliser)
+    rng = np.random.default_rng(0)
+    pool = (rng.standard_normal((30, 4)) * [1, 5, 0.1, 3] + [0, 100, 0, 2]).astype(np.float32)
+    assert (critic.values(pool) == 0).all()
+    for _ in range(40):
+        ppo.normaliser.update(pool[rng.integers(30, size=5)])
+        states, returns = pool[rng.integers(30, size=9)], 10 * rng.standard_normal(9)
+        critic.remember(batch_of(ppo.normalise(states), returns))
+        slow.remember(states, returns)
+        assert len(critic) == len(slow.entries)
+        asked = pool[rng.integers(30, size=3)]
+        found = critic.values(ppo.normalise(asked))
+        np.testing.assert_allclose(found, slow.values(asked), rtol=1e-3, atol=1e-3)
+    assert len(critic) == min(capacity, 30)
+
+
+def test_the_least_recently_used_state_is_overwritten(make_ppo):
+    settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
+    critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
+    a, b, c, d, e = np.eye(5, 4, dtype=np.float32)
+    for state, value in ((a, 1), (b, 2), (c, 3)):
+        critic.remember(batch_of(state[None], [value]))
+    assert critic.values(a[None]) == 1  # read: b is now the oldest
+    critic.remember(batch_of(d[None], [4]))
+    assert (critic.values(np.stack([a, c, d])) == [1, 3, 4]).all() and len(critic) == 3
+    assert critic.values(b[None]) != 2
+    critic.remember(batch_of(np.stack([a, b, c, d, e]), [5, 5, 5, 5, 5]))  # more than fit
+
+
+def test_one_experience_counts_at_once(make_ppo):
+    """A thousand states worth nothing; then, in one update, one that is worth 10."""
+    rng = np.random.default_rng(0)
+    known, place = rng.standard_normal((1000, 4)), np.array([0.5, -0.5, 0.5, 0.5])
+    near = (place + 0.02 * rng.standard_normal((20, 4))).astype(np.float32)
+    far = (-place + 0.02 * rng.standard_normal((20, 4))).astype(np.float32)
+    change = {}
+    for critic in (DICTIONARY | {"kernel_bandwidth": 0.001}, {"kind": "network"}):
+        ppo = make_ppo(critic)
+        ppo.normaliser.update(known)
+        for _ in range(30):
+            ppo.update(batch_of(known, np.zeros(1000)))
+        before = [ppo.critics["extrinsic"].values(states) for states in (near, far)]
+        ppo.update(batch_of(place[None], [10]))
+        after = [ppo.critics["extrinsic"].values(states) for states in (near, far)]
+        change[critic["kind"]] = [(b - a).mean() for a, b in zip(before, after, strict=True)]
+    assert change["dictionary"][0] > 5 and abs(change["dictionary"][1]) < 0.1
+    assert abs(change["network"][0]) < 1
+
+
+@pytest.mark.parametrize("minibatch_size", [None, 16])
+def test_the_actor_learns_as_with_networks(make_ppo, minibatch_size):
+    batch = batch_of(np.random.default_rng(0).standard_normal((50, 4)), np.ones(50))
+    ppos = [make_ppo(c, minibatch_size=minibatch_size) for c in (DICTIONARY, {"kind": "network"})]
+    norms = [ppo.update(batch).gradient_norms for ppo in ppos]
+    assert (ppos[0].policy.parameters == ppos[1].policy.parameters).all()
+    assert norms[0] == {"actor": norms[1]["actor"], "extrinsic": 0.0, "intrinsic": 0.0}
+    assert list(ppos[0].optimisers) == ["actor"]
+
+
+@pytest.mark.parametrize("settings", [{}, {"normalise_observations": False, "rollout_steps": 60}])
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])
+def test_saved_midway_it_continues_to_the_bit(run_config, environment, settings):
+    ppo = {"critic": DICTIONARY | {"capacity": 150}} | settings
+    config = run_config(environment, "mace_full", 0, episodes=10, ppo=ppo)
+    original, restored = Trainer(config), Trainer(config)
+    rounds = original.run()
+    while len(original.records) < 5:
+        next(rounds)
+    saved = archive(copy.deepcopy(original.state_dict()))
+    restored.load_state_dict(torch.load(io.BytesIO(saved), weights_only=True))
+    assert finish(original).records == finish(restored).records
+    assert archive(original.state_dict()) == archive(restored.state_dict())
+
+
+@pytest.mark.parametrize("environment", ["CartPole-v1", "FrozenLake-v1"])
+@pytest.mark.parametrize("normalise", [False, True])
+def test_agent_on_disk_has_the_same_values(run_config, tmp_path, environment, normalise):
+    ppo = {"critic": DICTIONARY, "normalise_observations": normalise}
+    config = run_config(environment, "mace_fixed", 0, episodes=4, ppo=ppo)
+    empty = Agent(Trainer(config).ppo)
+    run.run(config, tmp_path)
+    agent, trainer = load_agent(tmp_path), finish(config)
+    space = trainer.environment.observation_space
+    space.seed(0)
+    rows = np.stack([trainer.environment.encode(space.sample()) for _ in range(40)])
+    seen = trainer.ppo.normalise(rows.clip(-3, 3))
+    for kind, critic in trainer.ppo.critics.items():
+        values = agent.critics[kind](torch.from_numpy(seen))[:, 0]
+        np.testing.assert_allclose(values, critic.values(seen), rtol=1e-3, atol=1e-3)
+        assert (empty.critics[kind](torch.from_numpy(seen)) == 0).all()
+
+
+@pytest.mark.parametrize("variant", ["ppo", "mace_fixed"])
+def test_it_learns_cartpole(run_config, variant):
+    config = run_config("CartPole-v1", variant, 1, episodes=80, ppo={"critic": DICTIONARY})
+    returns = [record.extrinsic_return for record in finish(config).records]
+    assert np.mean(returns[:10]) < 60 and np.mean(returns[-20:]) > 150  # random actions: 22
+
+
+@pytest.mark.parametrize(
+    ("critic", "message"),
+    [
+        ({"neighbours": 2001}, "neighbours is 2001, which must not exceed capacity, 2000"),
+        ({"learning_rate": 1.5}, "ppo.critic.learning_rate is 1.5, but .* less than or equal to 1"),
+        ({"kind": "table"}, "ppo.critic .*'table'"),
+        ({"capacty": 3}, "unknown key 'ppo.critic.capacty' .* 'capacity'"),
+    ],
+)
+def test_wrong_settings_get_one_line(run_config, critic, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        run_config("CartPole-v1", "ppo", ppo={"critic": DICTIONARY | critic})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,254 @@
+"""The exploration tasks: returns by search or by hand, borrowed dynamics, exact resumption."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from shared import environment_of
+
+from mace_rl.config.study import Study, read_study
+from mace_rl.environments.tasks import BarrenRegion, DeepSea, MetresPassed
+
+ROOT = Path(__file__).parents[1]
+NORTH, EAST, SOUTH, WEST = range(4)
+
+# By state and action: probability, next state, reward, end; as Gymnasium's grids have it.
+Table = Mapping[int, Mapping[int, list[tuple[float, int, float, bool]]]]
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    return read_study([ROOT / "config.yaml", ROOT / "config" / "exploration.yaml"])
+
+
+def value(table: Table, start: int, steps: int, over: Callable) -> float:
+    """Expected return of so many steps, `over` the actions: `np.mean` for random ones, or `max`."""
+
+    def ahead(ways: list, values: dict) -> float:
+        return sum(p * (reward + (not end) * values[then]) for p, then, reward, end in ways)
+
+    values = dict.fromkeys(table, 0.0)
+    for _ in range(steps):
+        values = {s: over([ahead(table[s][a], values) for a in table[s]]) for s in table}
+    return float(values[start])
+
+
+def random_actions(env: gymnasium.Env, seed: int) -> Iterator:
+    env.action_space.seed(seed)
+    return (env.action_space.sample() for _ in itertools.count())
+
+
+def play(env: gymnasium.Env, actions: Iterable) -> tuple[list, list[float], bool]:
+    """Observations from the reset on, rewards, and whether the last one is terminal."""
+    observations, rewards, terminated = [env.reset()[0]], [], False
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return observations, rewards, terminated
+
+
+def test_gymnasium_accepts_them(study, recwarn):
+    for name in study.environments:
+        check_env(gymnasium.make(name, disable_env_checker=True).unwrapped, skip_render_check=True)
+        if name != "SparseHopper-v0":  # about a method `seed`, which Bullet's have
+            assert not [str(warning.message) for warning in recwarn]
+        recwarn.clear()
+
+
+def test_an_aged_environment_is_replayed_by_a_fresh_one(study):
+    """To the bit, from the generator's state between two episodes."""
+    for name in study.environments:
+        aged, fresh = environment_of(name, 1), environment_of(name, 2)
+        for episode in range(3):
+            play(aged.env, random_actions(aged.env, episode))
+        fresh.generator.bit_generator.state = aged.generator.bit_generator.state
+        for episode in range(2):
+            ran = [play(env.env, random_actions(env.env, episode)) for env in (aged, fresh)]
+            (observations, *rest), (again, *the_same) = ran
+            assert np.array_equal(observations, again) and rest == the_same, name
+
+
+def test_random_returns_of_the_study(study):
+    """As the configuration has them, measured: against the exact expectations."""
+    expected = {f"DeepSea{size}-v0": 2.0**-size - 0.005 for size in (10, 20)}
+    for name in ("FrozenLake8x8Deterministic-v0", "CliffWalking200-v0"):
+        env = gymnasium.make(name).unwrapped
+        start = int(np.argmax(env.initial_state_distrib))
+        expected[name] = value(env.P, start, 200, np.mean)
+    env = BarrenRegion()
+    expected["BarrenRegion-v0"] = value(transitions(env), env.kinds.index("S"), 60, np.mean)
+    expected |= dict.fromkeys(("SparseMountainCar-v0", "SparseHopper-v0"), 0.0)
+    for name in study.environments:
+        given = study.metrics.random_return_in(name)
+        assert given == pytest.approx(expected[name], rel=0.02, abs=0.001), name
+
+
+# --- Gymnasium's --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("skilled", [False, True])
+def test_mountain_car_is_gymnasiums_but_for_the_reward(skilled):
+    ours, theirs = gymnasium.make("SparseMountainCar-v0"), gymnasium.make("MountainCar-v0")
+    for seed in range(3):
+        state, rng = ours.reset(seed=seed)[0], np.random.default_rng(seed)
+        assert np.array_equal(state, theirs.reset(seed=seed)[0])
+        rewards, over = [], False
+        while not over:
+            swing_up = skilled and rng.random() < 0.9
+            action = 2 * int(state[1] >= 0) if swing_up else int(rng.integers(3))
+            state, reward, *ends, _ = ours.step(action)
+            expected, _, *expected_ends, _ = theirs.step(action)
+            assert np.array_equal(state, expected) and ends == expected_ends
+            rewards.append(reward)
+            over = any(ends)
+        assert rewards == [0.0] * (len(rewards) - 1) + [float(skilled)]
+        assert (len(rewards) < 200) == skilled == (state[0] >= 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "way", "total"),
+    [
+        ("FrozenLake8x8Deterministic-v0", "ldru", "r" * 7 + "d" * 7, 1),
+        ("CliffWalking200-v0", "urdl", "u" + "r" * 11 + "d", -13),
+        ("CliffWalking200-v0", "urdl", "u" * 3 + "r" * 11 + "d" * 3, -17),  # along the other edge
+    ],
+)
+def test_returns_of_the_grids(name, order, way, total):
+    env = gymnasium.make(name)
+    _, rewards, terminated = play(env, [order.index(step) for step in way])
+    assert terminated and len(rewards) == len(way) and sum(rewards) == total
+    _, rewards, terminated = play(env, itertools.repeat(order.index("u")))
+    assert not terminated and len(rewards) == 200
+
+
+# --- Deep sea -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 9])
+def test_returns_of_the_deep_sea(size):
+    """Of all sequences of actions: one pays, and the others cost their moves to the right."""
+    env, returns, visited = DeepSea(size), [], set()
+    for actions in itertools.product((0, 1), repeat=size):
+        cells, rewards, terminated = play(env, actions)
+        assert terminated and len(rewards) == size and cells[-1] == size * size
+        assert [cell // size for cell in cells] == list(range(size + 1))  # a row a step
+        visited.update(cells)
+        returns.append(sum(rewards))
+    # Each cell has one action for right, so k moves to the right are in C(size, k) sequences.
+    expected = [-0.01 * k / size for k in range(size) for _ in range(math.comb(size, k))]
+    assert sorted(returns) == pytest.approx(sorted([*expected, 0.99]))
+    triangle = {row * size + column for row in range(size) for column in range(row + 1)}
+    assert visited == triangle | {size * size}
+
+
+def test_the_deep_sea_is_bsuites_whatever_the_seed():
+    expected = np.random.RandomState(42).binomial(1, 0.5, [10, 10]).ravel().tolist()
+    for seed in range(3):
+        env = gymnasium.make("DeepSea10-v0")
+        env.reset(seed=seed)
+        assert env.unwrapped.right == expected
+
+
+# --- Hopper -------------------------------------------------------------------------------------
+
+
+class Walker(gymnasium.Env):
+    """Is where the action says, in metres from its start; its own robot."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-10, 10, (1,))
+    robot = property(lambda self: self)
+
+    def reset(self, *, seed=None, options=None):
+        self.body_real_xyz = [0.3, 0, 0]
+        return self.body_real_xyz[:1], {}
+
+    def step(self, action):
+        self.body_real_xyz = [0.3 + action, 0, 0]
+        return self.body_real_xyz[:1], 7.0, False, False, {}
+
+
+def test_metres_are_paid_once():
+    env = MetresPassed(Walker(), distance=0.5)
+    for _ in range(2):
+        rewards = play(env, [0.4, 0.6, 0.1, 0.7, 1.7, -3.0, 1.9, 2.1])[1]
+        assert rewards == [0, 1, 0, 0, 2, 0, 0, 1]
+
+
+def test_the_hopper_is_bullets_but_for_the_reward():
+    """Pushed, too: by itself it hardly gets anywhere before it falls."""
+    envs = [environment_of(name).env for name in ("SparseHopper-v0", "HopperBulletEnv-v0")]
+    actions, totals = random_actions(envs[0], 0), []
+    for push in (0, 10):  # forward, in metres a second
+        assert np.array_equal(*(env.reset()[0] for env in envs))
+        for env in (env.unwrapped for env in envs):
+            env._p.resetBaseVelocity(env.robot.objects[0], [push, 0, 0])
+        places, rewards, over = [0.0], [], False
+        while not over:
+            action = next(actions)
+            (state, reward, *ends, _), (expected, _, *expected_ends, _) = (
+                env.step(action) for env in envs
+            )
+            assert np.array_equal(state, expected) and ends == expected_ends
+            places.append(envs[1].unwrapped.robot.body_real_xyz[0])
+            rewards.append(reward)
+            over = any(ends)
+        assert np.array_equal(np.cumsum(rewards), np.maximum.accumulate(places)[1:] // 0.5)
+        totals.append(sum(rewards))
+    assert totals[0] == 0 and totals[1] >= 2
+
+
+# --- Barren region ------------------------------------------------------------------------------
+
+
+def transitions(env: BarrenRegion) -> Table:
+    """Every action in every cell, tried."""
+    env.reset(seed=0)
+    table = {}
+    for cell, action in itertools.product(range(len(env.kinds)), range(4)):
+        env.cell = cell
+        _, reward, terminated, _, _ = env.step(action)
+        table.setdefault(cell, {})[action] = [(1.0, env.cell, reward, terminated)]
+    return table
+
+
+def test_the_way_through_the_corridors():
+    legs = [(WEST, 9), (NORTH, 2), (EAST, 5), (NORTH, 2), (EAST, 4)]
+    env = gymnasium.make("BarrenRegion-v0")
+    _, rewards, end = play(env, [action for action, length in legs for _ in range(length)])
+    assert end and rewards == [0.0] * 9 + [0.1] + [0.0] * 11 + [0.9]
+    # There is no shorter way to either reward, and none that pays twice.
+    table, start = transitions(env.unwrapped), env.unwrapped.kinds.index("S")
+    returns = [value(table, start, steps, max) for steps in (9, 10, 21, 22, 60)]
+    assert returns == pytest.approx([0, 0.1, 0.1, 1, 1])
+    assert table == transitions(BarrenRegion(screen=0))
+    gate = env.unwrapped.kinds.index("^")
+    beyond = table[gate][NORTH][0][1]
+    assert beyond != gate and table[beyond][SOUTH][0][1] == beyond
+
+
+def test_only_the_room_is_full_of_news():
+    env = gymnasium.make("BarrenRegion-v0")
+    env.reset(seed=0)
+    screens, generator = [], env.unwrapped.np_random
+    for episode in range(30):
+        env.reset()
+        for action in itertools.islice(random_actions(env, episode), 59):
+            before = generator.bit_generator.state
+            observation, reward, *_ = env.step(action)
+            in_room = observation[0] > 0.5  # the last four of the map's fifteen columns
+            assert (generator.bit_generator.state != before) == in_room
+            assert observation[2:].any() == in_room and not (in_room and reward)
+            if in_room:
+                screens.append(observation[2:])
+    screens = np.array(screens)
+    assert len(screens) > 300 and len(np.unique(screens)) == screens.size
+    assert np.abs(screens).max() <= 1 and screens.mean() == pytest.approx(0, abs=0.1)
+    assert screens.var(axis=0) == pytest.approx(1 / 3, abs=0.06)

@@ -1,0 +1,122 @@
+"""How much of β's credit is signal, for each objective tried, and how well it knows the update.
+
+.venv/bin/python tools/meta_signal.py ENVIRONMENT EPISODES SEEDS [CONFIG ...]
+
+Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and prints, for each sixth of
+training: the signal-to-noise ratio per episode of each objective, mean over standard deviation over
+episodes and seeds; and the cosine between the direction that credit is given along and what a
+little more β really does to the policy's weights, by finite differences through the whole update.
+`docs/method.md` explains the objectives.
+"""
+
+import copy
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+
+from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.config.reading import merge, read_yaml
+from mace_rl.config.study import load_study
+from mace_rl.experience import extrinsic_part, intrinsic_parts, steps, total_advantages
+from mace_rl.train import Experience, Trainer
+
+BETA, HORIZON, STEP = 0.4, 10, 0.05
+PROBES = 60  # updates of a run whose finite difference is taken
+
+
+class Probe(Trainer):
+    """A run at constant β that measures every objective and changes nothing."""
+
+    def measure(self) -> dict[str, list[float]]:
+        """Train; for each objective a value for each update, NaN where there is none."""
+        self.rows: dict[str, list[float]] = defaultdict(list)
+        self.past: list[tuple[np.ndarray, np.ndarray, float]] = []
+        self.every = max(1, self.config.episodes // PROBES)
+        for _ in self.run():
+            pass
+        return self.rows
+
+    def adapt(self, rollout: list[Experience]) -> float | None:
+        """Note what each objective would say of the βs before."""
+        extrinsic = np.concatenate([extrinsic_part(item) for item in rollout])
+        centred = self.config.ppo.centre_advantages
+        if centred:
+            extrinsic -= extrinsic.mean()
+        total, part = total_advantages(rollout), np.sum(intrinsic_parts(rollout), axis=0)
+        vectors = self.ppo.policy_gradients(
+            *steps(rollout),
+            [extrinsic, normalised(total, centred), normalised_change(total, part, centred)],
+        )
+        extrinsic_gradient, update, change = (vector.astype(np.float64) for vector in vectors)
+        preconditioned = self.ppo.optimisers["actor"].preconditioned(change)
+        unit = extrinsic_gradient / (np.linalg.norm(extrinsic_gradient) + 1e-12)
+        nan = float("nan")
+        last = self.past[-1] if self.past else None
+        self.rows["unit length"].append(unit @ last[0] / last[2] if last else nan)
+        self.rows["unscaled"].append(extrinsic_gradient @ last[0] if last else nan)
+        self.rows["preconditioned"].append(extrinsic_gradient @ last[1] if last else nan)
+        window = self.past[-HORIZON:]
+        self.rows[f"horizon {HORIZON}"].append(
+            sum(extrinsic_gradient @ item[1] for item in window) if window else nan
+        )
+        self.past = [*self.past[-HORIZON:], (change, preconditioned, np.linalg.norm(update) + 1e-8)]
+        probed = len(self.diagnostics) % self.every == 0
+        difference = self.finite_difference(rollout) if probed else None
+        for name, vector in (("plain", change), ("as Adam steps", preconditioned)):
+            cosine = nan
+            if difference is not None and np.linalg.norm(difference) > 0:
+                cosine = vector @ difference / np.linalg.norm(vector) / np.linalg.norm(difference)
+            self.rows[f"cosine, {name}"].append(cosine)
+        return None
+
+    def finite_difference(self, rollout: list[Experience]) -> np.ndarray:
+        """dθ'/dβ over 2 · STEP, through `improve`, which is then undone; float64 [n]."""
+        state = copy.deepcopy(self.ppo.state_dict())
+        ends = []
+        for sign in (1, -1):
+            changed = [
+                Experience(**vars(item) | {"beta": item.beta + sign * STEP}) for item in rollout
+            ]
+            self.improve(changed)
+            ends.append(self.ppo.policy.parameters.astype(np.float64))
+            self.ppo.load_state_dict(copy.deepcopy(state))
+        return (ends[0] - ends[1]) / (2 * STEP)
+
+
+def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> None:
+    """Print the table."""
+    config = read_yaml(Path("config.yaml"))
+    for overlay in overlays:
+        config = merge(config, read_yaml(Path(overlay)))
+    config["environments"] = [environment]
+    config["metrics"]["random_return"].setdefault(environment, 0.0)  # nothing is measured by it
+    own = config["environment_settings"].setdefault(environment, {})
+    own["episodes"] = episodes
+    config["variant_settings"]["mace_full"]["beta"] = {"kind": "constant", "value": BETA}
+    study = load_study(config, "meta_signal.py")
+    runs = [
+        Probe(study.run_config(environment, "mace_full", seed)).measure()
+        for seed in range(1000, 1000 + seeds)
+    ]
+    print(f"{environment}, {seeds} seeds, β = {BETA}")
+    updates = min(len(run["unscaled"]) for run in runs)
+    for part in np.array_split(np.arange(updates), 6):
+        cells = []
+        for name in runs[0]:
+            values = np.array([np.array(run[name])[part] for run in runs])
+            values = values[np.isfinite(values)]
+            shown = values.mean() if "cosine" in name else values.mean() / (values.std() or 1.0)
+            cells.append(f"{name} {shown:.2f}")
+        print(f"updates {part[0] + 1} to {part[-1] + 1}: " + ", ".join(cells))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
