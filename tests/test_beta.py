@@ -23,8 +23,10 @@ from mace_rl.beta.schedule import ExponentialSchedule
 from mace_rl.config.run import ExponentialBeta, RunConfig
 from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
+from mace_rl.experience import Experience
+from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
-from mace_rl.train import Experience, Trainer, beta_controller
+from mace_rl.train import Trainer
 
 ROOT = Path(__file__).parents[1]
 

@@ -15,9 +15,10 @@ from mace_rl.config.run import BanditBeta
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
+from mace_rl.factories import beta_controller
 from mace_rl.runs.checkpoint import archive
 from mace_rl.streams import Streams
-from mace_rl.train import Trainer, beta_controller
+from mace_rl.train import Trainer
 
 ROOT = Path(__file__).parents[1]
 ARMS = [0.0, 0.1, 0.4, 1.0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shared import environment_of
 
-from mace_rl import train
+from mace_rl import factories
 from mace_rl.bonus.curiosity import Curiosity, relevance
 from mace_rl.environments.rollout import Episode
 from mace_rl.streams import Streams
@@ -42,7 +42,7 @@ def make(run_config):
     def build(environment="CartPole-v1", **changes) -> Curiosity:
         changes = {"memory": {"write_every": 1}, "novelty": {"write_every": 1}} | changes
         config = run_config(environment, "mace_full", 0, **changes)
-        return train.intrinsic_reward(config, environment_of(environment), Streams(0))
+        return factories.intrinsic_reward(config, environment_of(environment), Streams(0))
 
     return build
 

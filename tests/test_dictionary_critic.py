@@ -8,7 +8,7 @@ import pytest
 import torch
 from shared import environment_of, finish
 
-from mace_rl import train
+from mace_rl import factories
 from mace_rl.agent.ppo import PPO, Batch
 from mace_rl.config.section import ConfigError
 from mace_rl.runs import run
@@ -28,7 +28,7 @@ def make_ppo(run_config):
     def make(critic=DICTIONARY, **settings) -> PPO:
         settings = {"normalise_observations": False, "critic": critic} | settings
         config = run_config("CartPole-v1", "ppo", 0, ppo=settings)
-        return train.ppo(config, environment_of("CartPole-v1"), True, Streams(0))
+        return factories.ppo(config, environment_of("CartPole-v1"), True, Streams(0))
 
     return make
 

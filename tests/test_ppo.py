@@ -9,7 +9,7 @@ import pytest
 import torch
 from shared import Twin, environment_of
 
-from mace_rl import train
+from mace_rl import factories
 from mace_rl.agent import kernels
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.advantages import generalised_advantages
@@ -30,7 +30,7 @@ def make_ppo(run_config):
         environment="CartPole-v1", seed=0, intrinsic=False, engine="compiled", **settings
     ) -> PPO:
         config = run_config(environment, "ppo", seed, ppo=settings, engine=engine)
-        return train.ppo(config, environment_of(environment, seed), intrinsic, Streams(seed))
+        return factories.ppo(config, environment_of(environment, seed), intrinsic, Streams(seed))
 
     return make
 

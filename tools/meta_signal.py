@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 from mace_rl.agent.advantages import normalised, normalised_change
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.study import load_study
-from mace_rl.experience import extrinsic_part, intrinsic_parts, steps, total_advantages
-from mace_rl.train import Experience, Trainer
+from mace_rl.experience import Experience, extrinsic_part, intrinsic_parts, steps, total_advantages
+from mace_rl.train import Trainer
 
 BETA, HORIZON, STEP = 0.4, 10, 0.05
 PROBES = 60  # updates of a run whose finite difference is taken

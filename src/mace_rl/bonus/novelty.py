@@ -202,26 +202,23 @@ class DensityNovelty(Novelty):
     def _replace_redundant(self, states: np.ndarray) -> None:
         """Let states that are far from the buffer take the places of entries close to others.
 
-        One after the other, the farthest first: once in the buffer a state is near its like, and an
-        entry whose nearest neighbour has just gone is not redundant any more.
+        Far and close by the k-th neighbour, with the largest k: a place is known that has so many
+        states in the buffer, also where they are equal. One after the other, the farthest first:
+        a state is not put in beside its like, and an entry of whose neighbours one has just gone
+        is not redundant any more.
         """
         mean = self.normaliser.mean.astype(np.float32)
         std = self.normaliser.std.astype(np.float32)
         sample = self.batches.integers(len(self.buffer), size=self.config.calibration_states)
-        sample = np.unique(sample)
-        apart = nearest(states, self.buffer, mean, std, 1)[0][:, 0]
-        squared, neighbours = nearest(self.buffer[sample], self.buffer, mean, std, 2)
-        itself_first = neighbours[:, 0] == sample  # not where entries are equal
-        squared, neighbours = (
-            squared[:, 1],
-            np.where(itself_first, neighbours[:, 1], neighbours[:, 0]),
-        )
-        gone = set()
-        for old in np.argsort(squared):
+        sample, k = np.unique(sample), max(self.config.neighbours)
+        apart = nearest(states, self.buffer, mean, std, k)[0][:, -1]
+        squared, neighbours = nearest(self.buffer[sample], self.buffer, mean, std, k + 1)
+        gone: set[int] = set()
+        for old in np.argsort(squared[:, -1]):
             new = int(np.argmax(apart))
-            if not apart[new] > squared[old]:
+            if not apart[new] > squared[old, -1]:
                 break
-            if int(neighbours[old]) in gone:
+            if not gone.isdisjoint(neighbours[old].tolist()):
                 continue
             gone.add(int(sample[old]))
             self.buffer[sample[old]] = states[new]
