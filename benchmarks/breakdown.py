@@ -29,7 +29,7 @@ SECTIONS = {
 }
 BONUS = {
     "update: critics": "ppo.critics.intrinsic.learn",
-    "novelty: k-NN": "curiosity.novelty.knn_novelty",
+    "novelty: k-NN": "curiosity.novelty.distances curiosity.novelty._replace_redundant",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.observe",
     "memory": "curiosity.memory.lookup curiosity.memory.write",
     "meta network": "controller.next_episode adapt",

@@ -129,8 +129,8 @@ def our_config(contestant: str, environment: str, seed: int) -> "RunConfig":
     from mace_rl.config.study import read_study
 
     config = read_study([ROOT / "config.yaml"]).run_config(environment, OURS[contestant], seed)
-    rollout_steps = 2048 if contestant == "ppo_2048" else config.ppo.rollout_steps
-    ppo = config.ppo.model_copy(update={"rollout_steps": rollout_steps})
+    whole = {"rollout_steps": 2048, "minibatch_size": None} if contestant == "ppo_2048" else {}
+    ppo = config.ppo.model_copy(update=whole)
     return config.model_copy(update={"ppo": ppo, "episodes": ENDLESS})
 
 

@@ -513,14 +513,19 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
         advantages -= advantages.mean() if config_ppo.centre_advantages else 0
         gradient = policy_gradient(watched, each, advantages)
         strength = np.sqrt(np.mean(advantages**2))
-        for earlier in range(max(0, number - 2), number):
-            for place, direction in enumerate(watched.rounds[earlier].directions):
-                along = gradient @ direction / strength
-                squares, weight = 0.99 * squares + along**2, 0.99 * weight + 1
-                item = watched.rounds[earlier].rollout[place]
-                influence = min(1, np.sqrt(np.mean(scaled(item, "intrinsic") ** 2)))
-                usual = np.sqrt(squares / weight)
-                credits[earlier][place] += along / usual * min(1, strength) * influence
+        judged = [
+            (earlier, place, gradient @ direction / strength)
+            for earlier in range(max(0, number - 2), number)
+            for place, direction in enumerate(watched.rounds[earlier].directions)
+        ]
+        if judged:
+            squares = 0.99 * squares + np.mean([along**2 for *_, along in judged])
+            weight = 0.99 * weight + 1
+        for earlier, place, along in judged:
+            item = watched.rounds[earlier].rollout[place]
+            influence = min(1, np.sqrt(np.mean(scaled(item, "intrinsic") ** 2)))
+            usual = np.sqrt(squares / weight)
+            credits[earlier][place] += along / usual * min(1, strength) * influence
         credits.append(np.zeros(len(each.rollout)))
         told = watched.diagnostics[number].beta_credit
         known = number >= 2 and [

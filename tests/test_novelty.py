@@ -22,6 +22,7 @@ def settings(**changes) -> NoveltyConfig:
             "buffer_size": 50,
             "write_every": 1,
             "neighbours": [1, 3, 8],
+            "calibration_states": 32,
             "knn_weight": 0.7,
             "density_hidden_units": 16,
             "density_learning_rate": 0.01,

@@ -392,7 +392,8 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
             extrinsic, intrinsic = parts(item, "advantages")
             own.extend(extrinsic / item.extrinsic_scale)
             weighted.extend(item.beta * intrinsic / item.intrinsic_scale)
-        expected["bonus_share"] = np.var(weighted) / (np.var(own) + np.var(weighted))
+        squares = np.square(own).sum(), np.square(weighted).sum()
+        expected["bonus_share"] = squares[1] / sum(squares)
         expected |= {f"gradient_norm_{name}": norms[name][at + 1] for name in norms}
         for kind, critic in critics[at].items():
             returns = np.concatenate([getattr(item, f"{kind}_returns") for item in rollout])

@@ -36,8 +36,9 @@ def diagnose(
         return float(values.sum() / len(values))
 
     has_bonus = rollout[0].bonus is not None
-    extrinsic = variance(stacked(extrinsic_part(item) for item in rollout))
-    weighted = variance(stacked(item.beta * intrinsic_part(item) for item in rollout))
+    own = stacked(extrinsic_part(item) for item in rollout)
+    added = stacked(item.beta * intrinsic_part(item) for item in rollout)
+    extrinsic, weighted = float(own @ own), float(added @ added)
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,

@@ -103,12 +103,13 @@ class Trainer:
         beta, bonus = 0.0, None
         reward = np.zeros(len(episode))
         intrinsic = reward, reward
-        if self.curiosity and self.controller:
+        if self.curiosity is not None and self.controller is not None:
             beta = self.controller.beta
             require_share("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
             require_share("the curiosity bonus", reward, 1e-6, self.curiosity.largest)
+            reward = np.maximum(reward, 0.0)
             intrinsic = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
             )
@@ -128,7 +129,7 @@ class Trainer:
             )
         )
         scales = self.ppo.advantage_scale("extrinsic"), 1.0
-        if self.curiosity:
+        if self.curiosity is not None:
             scales = scales[0], self.ppo.advantage_scale("intrinsic")
         return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic, *scales)
 
@@ -139,7 +140,7 @@ class Trainer:
         preconditions it. Shown are dg/dβ of each episode, preconditioned alike, and g_E, that of
         the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
         """
-        if not (self.controller and self.controller.learns):
+        if self.controller is None or not self.controller.learns:
             return None
         centred = self.config.ppo.centre_advantages
         extrinsic = np.concatenate([extrinsic_part(item) for item in rollout])
@@ -158,7 +159,7 @@ class Trainer:
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
-        if self.curiosity:
+        if self.curiosity is not None:
             returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
         advantages = normalised(total_advantages(rollout), self.config.ppo.centre_advantages)
         update = self.ppo.update(
@@ -182,8 +183,8 @@ class Trainer:
         """Everything the rest of the run depends on, at the end of a round."""
         return {
             "ppo": self.ppo.state_dict(),
-            "curiosity": self.curiosity.state_dict() if self.curiosity else None,
-            "controller": self.controller.state_dict() if self.controller else None,
+            "curiosity": self.curiosity.state_dict() if self.curiosity is not None else None,
+            "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
             "environment": self.environment.generator.bit_generator.state,
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
@@ -193,7 +194,7 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""
         self.ppo.load_state_dict(state["ppo"])
-        if self.curiosity and self.controller:
+        if self.curiosity is not None and self.controller is not None:
             self.curiosity.load_state_dict(state["curiosity"])
             self.controller.load_state_dict(state["controller"])
         self.noise.bit_generator.state = state["noise"]

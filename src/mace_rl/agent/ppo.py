@@ -1,5 +1,6 @@
 """Proximal Policy Optimization (Schulman et al. 2017) with one critic per kind of reward."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -267,8 +268,10 @@ class PPO:
             yield batch
             return
         order = self.minibatches.permutation(len(batch))
-        for start in range(0, len(batch), self.config.minibatch_size):
-            yield batch[order[start : start + self.config.minibatch_size]]
+        # As even as can be: a last one of two samples would step as far as one of 128.
+        count = math.ceil(len(batch) / self.config.minibatch_size)
+        for chosen in np.array_split(order, count):
+            yield batch[chosen]
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, normaliser and generator."""

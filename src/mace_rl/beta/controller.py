@@ -1,4 +1,4 @@
-"""The interface of whatever sets β, and the choice of it."""
+"""The interface of whatever sets β."""
 
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple

@@ -19,6 +19,7 @@ from mace_rl.beta.progress import Progress
 from mace_rl.config.run import MetaConfig
 from mace_rl.environments.rollout import Episode
 
+STATE_CLIP = 10.0  # bound of what the LSTM reads of a state, in standard deviations
 SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
 
 
@@ -86,6 +87,8 @@ class MetaAdaptation(BetaController):
         beta = self.beta
         self.normaliser.update(episode.observations[:-1])
         self.progress.update(float(episode.rewards.sum()))
+        if not self.learns:  # nobody will ask what the earlier ones were
+            self.sources.clear()
         self.sources.append(self.sequence(episode, bonus, beta))
 
     def sequence(self, episode: Episode, bonus: np.ndarray, beta: float) -> np.ndarray:
@@ -99,7 +102,8 @@ class MetaAdaptation(BetaController):
         actions = episode.actions
         if self.action_count:
             actions = np.eye(self.action_count, dtype=np.float32)[actions]
-        seen = np.concatenate([self.normaliser(episode.observations[:-1]), actions], axis=1)
+        states = self.normaliser(episode.observations[:-1]).clip(-STATE_CLIP, STATE_CLIP)
+        seen = np.concatenate([states, actions], axis=1)
         rewards = np.stack([episode.rewards, bonus], axis=1)
         length = self.config.max_sequence
         if length is not None and len(episode) > length:
@@ -113,9 +117,7 @@ class MetaAdaptation(BetaController):
 
     def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
         """See `BetaController`: judge the βs of the last updates, then remember this one's."""
-        for judged in self.judged:
-            judged.credit += self.alignment(gradient, strength, judged)
-            judged.updates += 1
+        self.credit_all(gradient, strength)
         done = [judged for judged in self.judged if judged.updates == self.config.horizon]
         self.judged = self.judged[len(done) :]
         self.judged += [self.judge(self.sources.popleft(), effect) for effect in effects]
@@ -137,17 +139,23 @@ class MetaAdaptation(BetaController):
         direction = effect.direction / np.float32(length) if length > 0 else effect.direction
         return Judged(source, direction, min(1.0, effect.influence))
 
-    def alignment(self, gradient: np.ndarray, strength: float, judged: Judged) -> float:
-        """One term of the credit, in units of its running root mean square."""
-        if not strength > 0:
-            return 0.0
-        along = float(gradient @ judged.direction) / strength
-        self.alignments = SCALE_DECAY * self.alignments + along**2
+    def credit_all(self, gradient: np.ndarray, strength: float) -> None:
+        """Add one term to the credit of every β under judgement, in units of its usual size.
+
+        That is a running root mean square, in which each update counts as one.
+        """
+        for judged in self.judged:
+            judged.updates += 1
+        if not (self.judged and strength > 0):
+            return
+        along = [float(gradient @ judged.direction) / strength for judged in self.judged]
+        squares = sum(value**2 for value in along) / len(along)
+        self.alignments = SCALE_DECAY * self.alignments + squares
         self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
-        if self.alignments == 0:
-            return 0.0
         usual = math.sqrt(self.alignments / self.alignment_weight)
-        return along / usual * min(1.0, strength) * judged.influence
+        if usual > 0:
+            for judged, value in zip(self.judged, along, strict=True):
+                judged.credit += value / usual * min(1.0, strength) * judged.influence
 
     def bounded(self, credit: float) -> float:
         """A sum of `horizon` terms as one whose noise has size 1, within `max_credit`."""

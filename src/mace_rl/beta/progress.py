@@ -1,4 +1,4 @@
-"""How training goes: what lets β follow progress and stagnation (claim C9) over many episodes."""
+"""How training goes: what lets β follow progress and stagnation over many episodes."""
 
 import math
 from typing import Any

@@ -106,8 +106,7 @@ class PredictionError(IntrinsicReward):
             self.normaliser.update(episode.observations[1:])
         inputs = self.inputs(episode)
         order = self.generator.permutation(len(inputs))
-        for start in range(0, len(order), self.config.batch_size):
-            chosen = order[start : start + self.config.batch_size]
+        for chosen in np.array_split(order, math.ceil(len(order) / self.config.batch_size)):
             self.optimiser.step(self.gradient(inputs[chosen]))
 
     def state_dict(self) -> dict[str, Any]:

@@ -59,13 +59,14 @@ def novelty(
     match kind:
         case "counts" if isinstance(space, Discrete):
             return CountNovelty(config, size)
-        case "density":
+        case "density" if isinstance(space, Box):
             return DensityNovelty(config, engine, normaliser, streams)
         case "custom":
             given = size, streams["novelty"]
             return make(config.estimator, "novelty.estimator", *given, **config.arguments)
     raise ConfigError(
-        f"novelty.kind is 'counts', but the observations are {space}, whose states do not repeat"
+        f"novelty.kind is {kind!r}, but the observations are {space}: 'counts' is for Discrete"
+        " ones, 'density' for Box"
     )
 
 
@@ -86,7 +87,7 @@ class CountNovelty(Novelty):
         novelty = np.empty(len(states))
         for t, state in enumerate(states.argmax(axis=1)):
             counts[state] += 1
-            novelty[t] = 1 / max(counts[state], 1.0)
+            novelty[t] = 1 / counts[state]
         return novelty
 
     def observe(self, states: np.ndarray) -> None:

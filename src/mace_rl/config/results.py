@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from mace_rl.config.section import ConfigError, Reference, Section
 
@@ -36,6 +36,15 @@ class MetricsConfig(Section):
     comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
     regret: RegretConfig | None = None  # None: there is no regret.csv
     custom: list[Reference] = Field(default=[])  # further ones: mace_rl.results.metrics.Metric
+
+    @model_validator(mode="after")
+    def _compared_once(self) -> "MetricsConfig":
+        for place, pair in enumerate(self.comparisons):
+            if pair[0] == pair[1] or pair in self.comparisons[:place]:
+                raise ValueError(f"comparisons has {pair}: two different variants, each pair once")
+        if self.regret and self.regret.variant in self.regret.constants:
+            raise ValueError(f"regret.constants has the variant itself, {self.regret.variant!r}")
+        return self
 
     def random_return_in(self, environment: str) -> float:
         """The configured mean return of random actions; a `ConfigError` where there is none."""

@@ -95,12 +95,12 @@ class PPOConfig(Section):
     normalise_observations: bool
     # Rewards are divided by the running standard deviation of their discounted sums; extrinsic ones
     # by at least 1, lest tiny costs be blown up.
-    scale_rewards: bool = False
+    scale_rewards: bool
     # Extrinsic and intrinsic advantages are each divided by their running root mean square before β
     # weighs them, extrinsic ones by at least `smallest_advantage`: β is then a relative strength.
-    scale_advantages: bool = False
-    smallest_advantage: PositiveFloat = 0.1
-    centre_advantages: bool = False  # subtract the rollout's mean from total advantages
+    scale_advantages: bool
+    smallest_advantage: PositiveFloat
+    centre_advantages: bool  # subtract the rollout's mean from total advantages
 
 
 class MemoryConfig(Section):
@@ -132,7 +132,7 @@ class NoveltyConfig(Section):
     buffer_size: PositiveInt  # visited states that k-NN and density refer to, a cover of ...
     write_every: PositiveInt  # ... one in so many
     neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
-    calibration_states: PositiveInt = 32  # a sample of them says what distance is usual
+    calibration_states: PositiveInt  # a sample of them says what distance is usual
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
     density_hidden_units: PositiveInt
     density_learning_rate: PositiveFloat = Field(lt=1)
@@ -258,6 +258,8 @@ class BanditBeta(Section):
 
     @model_validator(mode="after")
     def _arms_fit(self) -> "BanditBeta":
+        if len(set(self.arms)) < len(self.arms):
+            raise ValueError(f"arms has a β twice: {self.arms}")
         if self.window < len(self.arms):
             raise ValueError(
                 f"window is {self.window}, which must hold each of the {len(self.arms)} arms"
@@ -272,6 +274,14 @@ class ExponentialBeta(Section):
     initial: float = Field(ge=0, le=1)
     decay: PositiveFloat = Field(le=1)
     floor: float = Field(ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _falls(self) -> "ExponentialBeta":
+        if self.floor > self.initial:
+            raise ValueError(
+                f"floor is {self.floor}, which must not exceed initial, {self.initial}"
+            )
+        return self
 
 
 class MetaBeta(Section):
@@ -324,7 +334,7 @@ class RunConfig(Section):
         if not isinstance(values, dict):
             return values
         unused = unused_sections(values)
-        values = {"bonus": {"kind": "curiosity"}} | values  # there was no other before
+        values = {"bonus": {"kind": "curiosity"}} | values
         return {key: value for key, value in values.items() if key not in unused}
 
     @model_validator(mode="after")

@@ -29,8 +29,6 @@ from mace_rl.config.section import ConfigError, Section, check, explain, short
 # name its module too, as in Gymnasium: package.module:Id.
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 
-LOOK = ("label", "colour")  # of a variant in tables and figures, not a setting of its runs
-
 
 def _colour(name: str) -> str:
     if not is_color_like(name):

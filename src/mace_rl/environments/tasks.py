@@ -106,15 +106,13 @@ class BarrenRegion(gymnasium.Env):
     """A corridor that leads to the reward, and a room full of news that never does.
 
     From the start S it is one step east to the room (~), where every step costs 0.001, and twenty
-    steps west and north, along four bends, to the goal (G), which gives 1 and ends the episode.
-    Actions 0 to 3 go north, east, south and west, or nowhere if there is a wall (#). In the room
-    the observation has a screen with new random numbers every step; elsewhere its `screen` numbers
-    are 0.
+    steps west, north and back east, along four bends, to the goal (G), which gives 1 and ends the
+    episode. Actions 0 to 3 go north, east, south and west, or nowhere if there is a wall (#). In
+    the room the observation has a screen with new random numbers every step; elsewhere its `screen`
+    numbers are 0.
 
     - PPO learns to leave the room, for its cost, and seldom strays as far as the goal.
-    - Novelty alone mostly outweighs the cost, as the screen never shows the same twice. In time
-      screens fill the buffer of visited states, and some cell of the corridor, with too few copies
-      left in it, stays new however often it is visited: then the agent stands there.
+    - Novelty alone mostly outweighs the cost, as the screen never shows the same twice.
     - With novelty × relevance the room is new at first too. But one number, unlike an image, is
       soon like one that memory holds, and nothing good came of that: less of the room's bonus is
       left against the cost, while what lies ahead in the corridor is like nothing remembered.

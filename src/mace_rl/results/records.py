@@ -47,7 +47,7 @@ class UpdateRecord:
     gradient_norm_extrinsic: float  # of that reward's critic
     gradient_norm_intrinsic: float
     beta: float  # mean over the rollout's episodes
-    bonus_share: float  # Var(β A_I) / (Var(A_E) + Var(β A_I))
+    bonus_share: float  # Σ(β A_I)² / (Σ A_E² + Σ(β A_I)²), in units of their scales
     novelty: float  # mean over the rollout's steps, like the next two
     relevance: float
     similarity: float  # of a state to what the memory holds

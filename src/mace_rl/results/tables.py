@@ -45,6 +45,12 @@ OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is na
     "initial_log_std": "Initial Log Standard Deviation (continuous actions)",
     "max_gradient_norm": "Maximal Gradient Norm",
     "normalise_observations": "Normalised Observations",
+    "entropy_coefficient": "Entropy Coefficient",
+    "critic": "Critic",
+    "scale_rewards": "Rewards over the Deviation of their Discounted Sums",
+    "scale_advantages": "Advantages over their Root Mean Square, by Kind of Reward",
+    "smallest_advantage": "Smallest Scale of Extrinsic Advantages",
+    "centre_advantages": "Centred Advantages",
 }
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit
