@@ -28,7 +28,7 @@ from benchmarks.settings import (
 # Environment steps of one training at the paper's budgets (2000, 2000, 6000 episodes), about: those
 # of `mace-rl train --variant ppo --seed 1000`, Hopper's extrapolated from 3800 episodes.
 PAPER_STEPS = {CARTPOLE: 918_000, ACROBOT: 215_000, HOPPER: 3_800_000}
-STUDY_SEEDS = 5
+STUDY_SEEDS = 10
 GROWTH = "time per step, last tenth ÷ second"
 
 # What the project set out to reach in steps per second of the first contestant ÷ the second's:

@@ -2,9 +2,9 @@
 
 .venv/bin/python tools/meta_signal.py ENVIRONMENT EPISODES SEEDS [CONFIG ...]
 
-Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and prints, for each sixth of
-training: the signal-to-noise ratio per episode of each objective, mean over standard deviation over
-episodes and seeds; and the cosine between the direction that credit is given along and what a
+Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and prints, for each third of
+training: the signal-to-noise ratio per update of each objective, mean over standard deviation over
+updates and seeds; and the cosine between the direction that credit is given along and what a
 little more β really does to the policy's weights, by finite differences through the whole update.
 `docs/method.md` explains the objectives.
 """
@@ -18,23 +18,39 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.advantages import normalised, normalised_change, root_mean_square
+from mace_rl.beta.controller import Effect
+from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.config.reading import merge, read_yaml
+from mace_rl.config.run import ConstantBeta
 from mace_rl.config.study import load_study
-from mace_rl.experience import Experience, extrinsic_part, intrinsic_parts, steps, total_advantages
+from mace_rl.experience import (
+    Experience,
+    extrinsic_part,
+    intrinsic_part,
+    intrinsic_parts,
+    steps,
+    total_advantages,
+)
+from mace_rl.factories import beta_controller
+from mace_rl.streams import Streams
 from mace_rl.train import Trainer
 
-BETA, HORIZON, STEP = 0.4, 10, 0.05
+BETA, STEP = 0.4, 0.05
 PROBES = 60  # updates of a run whose finite difference is taken
 
 
 class Probe(Trainer):
     """A run at constant β that measures every objective and changes nothing."""
 
-    def measure(self) -> dict[str, list[float]]:
-        """Train; for each objective a value for each update, NaN where there is none."""
+    def measure(self, judge: MetaAdaptation) -> dict[str, list[float]]:
+        """Train; for each objective a value for each update, NaN where there is none.
+
+        judge: gives the credit of the method, from this run's gradients.
+        """
         self.rows: dict[str, list[float]] = defaultdict(list)
-        self.past: list[tuple[np.ndarray, np.ndarray, float]] = []
+        self.past: tuple[np.ndarray, np.ndarray, float] | None = None
+        self.judge = judge
         self.every = max(1, self.config.episodes // PROBES)
         for _ in self.run():
             pass
@@ -55,15 +71,20 @@ class Probe(Trainer):
         preconditioned = self.ppo.optimisers["actor"].preconditioned(change)
         unit = extrinsic_gradient / (np.linalg.norm(extrinsic_gradient) + 1e-12)
         nan = float("nan")
-        last = self.past[-1] if self.past else None
+        last = self.past
         self.rows["unit length"].append(unit @ last[0] / last[2] if last else nan)
         self.rows["unscaled"].append(extrinsic_gradient @ last[0] if last else nan)
         self.rows["preconditioned"].append(extrinsic_gradient @ last[1] if last else nan)
-        window = self.past[-HORIZON:]
-        self.rows[f"horizon {HORIZON}"].append(
-            sum(extrinsic_gradient @ item[1] for item in window) if window else nan
-        )
-        self.past = [*self.past[-HORIZON:], (change, preconditioned, np.linalg.norm(update) + 1e-8)]
+        self.past = change, preconditioned, float(np.linalg.norm(update)) + 1e-8
+        self.judge.credit_all(vectors[0], root_mean_square(extrinsic))
+        judged, horizon = self.judge.judged, self.judge.config.horizon
+        done = [item for item in judged if item.updates == horizon]
+        self.judge.judged = judged[len(done) :]
+        credits = [self.judge.bounded(item.credit) for item in done]
+        self.rows["the method's"].append(float(np.mean(credits)) if credits else nan)
+        influence = root_mean_square(np.concatenate([intrinsic_part(item) for item in rollout]))
+        effect = Effect(preconditioned.astype(np.float32), influence)
+        self.judge.judged.append(self.judge.judge(None, effect))
         probed = len(self.diagnostics) % self.every == 0
         difference = self.finite_difference(rollout) if probed else None
         for name, vector in (("plain", change), ("as Adam steps", preconditioned)):
@@ -96,15 +117,17 @@ def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> No
     config["metrics"]["random_return"].setdefault(environment, 0.0)  # nothing is measured by it
     own = config["environment_settings"].setdefault(environment, {})
     own["episodes"] = episodes
-    config["variant_settings"]["mace_full"]["beta"] = {"kind": "constant", "value": BETA}
     study = load_study(config, "meta_signal.py")
-    runs = [
-        Probe(study.run_config(environment, "mace_full", seed)).measure()
-        for seed in range(1000, 1000 + seeds)
-    ]
+    constant = ConstantBeta(kind="constant", value=BETA)
+    runs = []
+    for seed in range(1000, 1000 + seeds):
+        settings = study.run_config(environment, "mace_full", seed)
+        probe = Probe(settings.model_copy(update={"beta": constant}))
+        judge = beta_controller(settings, probe.environment, Streams(seed))
+        runs.append(probe.measure(judge))
     print(f"{environment}, {seeds} seeds, β = {BETA}")
     updates = min(len(run["unscaled"]) for run in runs)
-    for part in np.array_split(np.arange(updates), 6):
+    for part in np.array_split(np.arange(updates), 3):
         cells = []
         for name in runs[0]:
             values = np.array([np.array(run[name])[part] for run in runs])
