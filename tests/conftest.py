@@ -8,6 +8,8 @@ from typing import Any
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import mace_rl  # noqa: F401  isort: skip  (arithmetic is chosen before NumPy is imported)
+
 import gymnasium
 import pytest
 

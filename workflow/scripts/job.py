@@ -9,6 +9,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from mace_rl import arithmetic
+
 PATIENCE = 1.0  # seconds between looks at whether Snakemake is alive
 
 logger = logging.getLogger("job")
@@ -41,6 +43,7 @@ def job(title: str, log: str) -> Iterator[None]:
     start = time.monotonic()
     try:
         yield
+        arithmetic.require()  # of the libraries that the body loaded
     except Exception as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         logger.exception("%s failed: %s", title, reason)

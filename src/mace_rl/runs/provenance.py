@@ -22,6 +22,8 @@ PACKAGES = (
     "pybullet",
     "pybullet-envs-gymnasium",
 )
+# What every run.json has.
+KEYS = {"config", "versions", "arithmetic", "sources", "machine", "outputs"}
 
 
 class ProvenanceError(ValueError):
@@ -75,7 +77,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """A `run.json`; `ProvenanceError` if it is not whole."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        missing = {"config", "versions", "sources", "machine", "outputs"} - set(record)
+        missing = KEYS - set(record)
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
         raise ProvenanceError(f"{path}: not readable: {error}") from None
     if missing:

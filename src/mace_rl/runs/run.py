@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from mace_rl import files, sources
+from mace_rl import arithmetic, files, sources
 from mace_rl.config.plugins import source_file
 from mace_rl.config.run import RunConfig
 from mace_rl.files import write_atomically
@@ -54,8 +54,9 @@ def run(
 
     Continues from its checkpoint if there is one of this very configuration, code and versions;
     otherwise says so in the log and starts afresh. Uses one thread. Raises `RunError` if another
-    process is at work in `directory`.
+    process is at work in `directory`, and `ArithmeticError` if arithmetic is not what was chosen.
     """
+    arithmetic.require()
     torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
     with exclusive(directory), threadpool_limits(1):
@@ -95,6 +96,7 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
     return {
         "config": config.settings(),
         "versions": provenance.versions(),
+        "arithmetic": arithmetic.in_use(),
         "sources": sources.digest(
             sources.PACKAGE / "runs" / "run.py",
             *(source_file(reference, key) for key, reference in config.references().items()),

@@ -59,7 +59,8 @@ def repeat(run_folder: Path) -> Repetition:
         now = read_record(folder / files.RECORD)
         after = read_episodes(folder / files.EPISODES, config.episodes)
     different = (before != after).any(axis=1).to_numpy()
-    origins = [{key: record[key] for key in ("versions", "sources")} for record in (then, now)]
+    kept = ("arithmetic", "versions", "sources")
+    origins = [{key: record[key] for key in kept} for record in (then, now)]
     for origin, record in zip(origins, (then, now), strict=True):
         origin["cpu"] = record["machine"]["cpu"]
     return Repetition(
