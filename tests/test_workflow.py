@@ -184,8 +184,8 @@ CHANGES = {  # of a file, from one text to another, and what is to be done then
         TRAIN | {"train": 2},
     ),
     "the order of keys and a comment": (
-        *("config.yaml", "    clip: 0.2 # [P] Table 2, ε\n    gae_lambda: 0.98 # [C]"),
-        *("    gae_lambda: 0.98\n    clip: 0.2 # [C]", {}),
+        *("config.yaml", "    clip: 0.2 # [P] Table 2, ε\n    gae_lambda: 0.99 # [C]"),
+        *("    gae_lambda: 0.99\n    clip: 0.2 # [C]", {}),
     ),
     "another seed": ("config.yaml", "seeds: [0]", "seeds: [0, 1]", TRAIN),
     "one environment less": ("config.yaml", ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
