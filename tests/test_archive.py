@@ -1,0 +1,57 @@
+"""Runs that are kept come out as they went in."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from mace_rl import files
+from mace_rl.runs.provenance import KEYS
+from tools import archive
+
+
+def make_run(folder: Path, text: str) -> None:
+    folder.mkdir(parents=True)
+    (folder / files.EPISODES).write_text(text)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    record = {key: {} for key in KEYS} | {"outputs": {files.EPISODES: digest}}
+    (folder / files.RECORD).write_text(json.dumps(record))
+    (folder / files.AGENT).write_bytes(b"not kept")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != files.AGENT
+    }
+
+
+def test_what_was_packed_comes_out(tmp_path: Path) -> None:
+    results, kept = tmp_path / "results", tmp_path / "kept"
+    for run in ("A-v1/ppo/seed0", "A-v1/ppo/seed10", "A-v1/ppo/seed9", "B-v0/mace_full/seed3"):
+        make_run(results / "runs" / run, f"records of {run}\n" * 50)
+    (results / "runs/A-v1/ppo/seed11").mkdir()  # not finished
+    assert archive.pack(results, kept) == 4
+    assert sorted(content(kept)) == ["A-v1/ppo.tar.xz", "B-v0/mace_full.tar.xz"]
+    assert archive.unpack(kept, tmp_path / "again") == 4
+    assert content(tmp_path / "again") == content(results)
+
+
+def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
+    for half in (0, 1):
+        make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", f"{half}\n")
+        make_run(tmp_path / f"whole/runs/A-v1/ppo/seed{half}", f"{half}\n")
+    archive.pack(tmp_path / "half1", tmp_path / "kept")
+    assert archive.pack(tmp_path / "half0", tmp_path / "kept") == 2
+    archive.pack(tmp_path / "whole", tmp_path / "kept whole")
+    assert content(tmp_path / "kept") == content(tmp_path / "kept whole")
+
+
+def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
+    run = tmp_path / "results/runs/A-v1/ppo/seed0"
+    make_run(run, "1\n")
+    (run / files.EPISODES).write_text("2\n")
+    with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
+        archive.pack(tmp_path / "results", tmp_path / "kept")

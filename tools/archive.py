@@ -1,0 +1,90 @@
+"""Keep finished runs small, or put kept ones back: exact, one file per environment and variant.
+
+    .venv/bin/python -m tools.archive pack RESULTS ARCHIVE      results/paper reference/study/paper
+    .venv/bin/python -m tools.archive unpack ARCHIVE RESULTS
+
+Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
+what is not kept. ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to
+those that are there; equal runs give equal files.
+"""
+
+import io
+import lzma
+import sys
+import tarfile
+from pathlib import Path
+
+from mace_rl import files
+from mace_rl.files import write_atomically
+from mace_rl.runs.provenance import file_digest, read_record
+
+KEPT = (files.EPISODES, files.RECORD)
+
+
+def read(archive: Path) -> dict[str, bytes]:
+    """What is in an archive, by name."""
+    with tarfile.open(archive, "r:xz") as tar:
+        return {member.name: tar.extractfile(member).read() for member in tar.getmembers()}
+
+
+def write(archive: Path, content: dict[str, bytes]) -> None:
+    """Write an archive without times and owners: equal content gives an equal file."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name in sorted(content, key=lambda name: (int(name[4 : name.index("/")]), name)):
+            member = tarfile.TarInfo(name)
+            member.size = len(content[name])
+            tar.addfile(member, io.BytesIO(content[name]))
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(archive, lzma.compress(buffer.getvalue(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def pack(results: Path, archives: Path) -> int:
+    """Add the finished runs of `results` to `archives`; returns how many there are now.
+
+    Raises `ValueError` if a run's records are not those that its `run.json` describes.
+    """
+    count = 0
+    for variant in sorted(results.glob("runs/*/*")):
+        archive = archives / variant.parent.name / f"{variant.name}.tar.xz"
+        content = read(archive) if archive.exists() else {}
+        for run in variant.glob("seed*"):
+            if not (run / files.RECORD).exists():
+                continue  # not finished
+            digests = read_record(run / files.RECORD)["outputs"]
+            if file_digest(run / files.EPISODES) != digests[files.EPISODES]:
+                raise ValueError(f"{run / files.EPISODES}: not the file that run.json describes")
+            content |= {f"{run.name}/{name}": (run / name).read_bytes() for name in KEPT}
+        if content:
+            write(archive, content)
+        count += len(content) // len(KEPT)
+    return count
+
+
+def unpack(archives: Path, results: Path) -> int:
+    """Put the runs in `archives` where they were below `results`; returns how many."""
+    count = 0
+    for archive in sorted(archives.glob("*/*.tar.xz")):
+        variant = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
+        content = read(archive)
+        for name, data in content.items():
+            (variant / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(variant / name, data)
+        count += len(content) // len(KEPT)
+    return count
+
+
+def main() -> None:
+    """Entry point."""
+    commands = {"pack": pack, "unpack": unpack}
+    if len(sys.argv) != 4 or sys.argv[1] not in commands:
+        sys.exit(__doc__)
+    try:
+        count = commands[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))
+    except (ValueError, OSError, tarfile.TarError, lzma.LZMAError) as error:
+        sys.exit(f"archive: {error}")
+    print(f"{count} runs in {sys.argv[3]}")
+
+
+if __name__ == "__main__":
+    main()
