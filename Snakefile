@@ -17,6 +17,7 @@ include: "workflow/rules/study.smk"
 localrules:
     all,
     metrics,
+    claims,
     table1,
     table2,
     comparisons,
@@ -39,10 +40,12 @@ rule all:
         f"{RESULTS}/figure2.pdf",
         f"{RESULTS}/figure2.png",
         f"{RESULTS}/figure2.csv",
+        *CLAIMS,
 
 
 include: "workflow/rules/train.smk"
 include: "workflow/rules/metrics.smk"
 include: "workflow/rules/tables.smk"
 include: "workflow/rules/figures.smk"
+include: "workflow/rules/claims.smk"
 include: "workflow/rules/terminal.smk"

@@ -42,6 +42,7 @@ ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "sample_efficiency": 201,
     "convergence_steps": 295,  # the slope has come down from 480 / 50 to a tenth of that
     "area_under_curve": 404.0,
+    "early_return": 20.0,
     "solved": 1.0,
     "sample_efficiency_common": 230,  # 22.1 + 0.75 · 377.9 = 305.5: 30 of 50 episodes at 500
     "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
@@ -451,7 +452,7 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
     )
     result = table(settings=settings)
     added = ["positive", "worst", "positive_censored"]
-    assert list(result.columns) == [*COLUMNS[:16], *added[:2], *COLUMNS[16:], added[2]]
+    assert list(result.columns) == [*COLUMNS[:17], *added[:2], *COLUMNS[17:], added[2]]
     pd.testing.assert_frame_equal(result[COLUMNS], table())
     for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
         returns = run["extrinsic_return"].tolist()

@@ -14,8 +14,8 @@ import scipy.stats
 from mace_rl.config.run import PPOConfig, TorchModule
 from mace_rl.config.study import read_study
 from mace_rl.results.metrics import Metric, all_metrics, metrics_columns
+from mace_rl.results.paper import PAPER_TABLE1
 from mace_rl.results.tables import (
-    PAPER_TABLE1,
     latex,
     supplement,
     supplement_latex,
@@ -198,6 +198,7 @@ def test_the_supplement_has_every_companion():
     assert [name for name, place in found if place == 0] == [
         "Final return",
         "Mean return of training",
+        "Mean return of the beginning",
         "Sample efficiency (common bar)",
         "Sample efficiency (range)",
         "Convergence (range)",

@@ -14,6 +14,7 @@ from mace_rl.config.reading import merge, read_yaml, typed
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 from mace_rl.config.plugins import source_file
+from mace_rl.results import paper
 from mace_rl.runs import provenance
 from mace_rl.sources import digest
 
@@ -35,6 +36,13 @@ RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = list(product(study.environments, study.variants, study.seeds))
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
+# The claim ledger is for a study that has all the paper makes claims of.
+TESTS_CLAIMS = (
+    set(paper.ENVIRONMENTS) <= set(study.environments)
+    and set(paper.VARIANTS) <= set(study.variants)
+    and set(paper.ENVIRONMENTS) <= set(study.metrics.reference_return)
+)
+CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
 BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
 
 

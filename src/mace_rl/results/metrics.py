@@ -218,6 +218,12 @@ def convergence_steps_range(curve: LearningCurve) -> Episode:
     return curve.first(settled & curve.learned, settings.moving_average)
 
 
+def early_return(curve: LearningCurve) -> float:
+    """Mean return of the first episodes, as many as `last_part` has: how steep the curve begins."""
+    count = len(last_part(curve.returns, curve.settings.final_fraction))
+    return float(np.mean(curve.returns[:count]))
+
+
 def solved(curve: LearningCurve) -> float:
     """The share of the last episodes (`last_part`) whose return is at least `solved_return`."""
     return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
@@ -230,6 +236,7 @@ METRICS = (
     Metric(  # under the learning curve, per episode
         "area_under_curve", "Mean return of training", "return", lambda curve: curve.returns.mean()
     ),
+    Metric("early_return", "Mean return of the beginning", "return", early_return),
     Metric("solved", "Solved at the end", "share", solved, "solved_return"),
     Metric(
         "sample_efficiency_common",

@@ -81,6 +81,42 @@ def paired_comparison(
     return PairedComparison(float(np.mean(difference)), float(low), float(high), float(p_value))
 
 
+def stratified_comparison(
+    differences: Sequence[np.ndarray],
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> PairedComparison:
+    """The mean over strata (environments) of the mean paired difference, [seeds] in each.
+
+    The bootstrap resamples, and the sign-flip test flips, within the strata. With fewer than 10
+    seeds in one of them the interval is Student's t with the degrees of freedom of the smallest.
+    With one stratum: `paired_comparison`.
+    """
+    if len(differences) == 1:
+        zero = np.zeros_like(differences[0])
+        return paired_comparison(differences[0], zero, confidence, repetitions, generator)
+    total = sum(len(values) for values in differences)
+    weighted = np.concatenate(  # whose mean is the mean of the strata's means
+        [values * total / (len(differences) * len(values)) for values in differences]
+    )
+    tested = paired_comparison(weighted, np.zeros(total), confidence, repetitions, generator)
+    smallest = min(len(values) for values in differences)
+    if smallest == 1:
+        return tested._replace(low=np.nan, high=np.nan)
+    if interval_kind(smallest) == "t":
+        errors = [np.var(values, ddof=1) / len(values) for values in differences]
+        error = np.sqrt(np.sum(errors)) / len(differences)
+        half = float(scipy.stats.t.ppf((1 + confidence) / 2, smallest - 1) * error)
+        return tested._replace(low=tested.difference - half, high=tested.difference + half)
+    means = [
+        np.mean(values[generator.integers(len(values), size=(repetitions, len(values)))], axis=1)
+        for values in differences
+    ]
+    low, high = percentiles(np.mean(means, axis=0), confidence)
+    return tested._replace(low=float(low), high=float(high))
+
+
 def logrank(
     x: np.ndarray,
     y: np.ndarray,

@@ -12,22 +12,8 @@ import pandas as pd
 from mace_rl.config.results import MetricsConfig
 from mace_rl.config.run import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.results.metrics import Metric, all_metrics
+from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
 from mace_rl.results.statistics import interval_kind, mean_interval
-
-PAPER_METRICS = ("sample_efficiency", "convergence_steps")  # of Table 1
-
-# Paper, Table 1: (environment, variant) -> sample efficiency, convergence steps, in episodes.
-PAPER_TABLE1 = {
-    ("Acrobot-v1", "ppo"): (186, 617),
-    ("Acrobot-v1", "mace_fixed"): (201, 595),
-    ("Acrobot-v1", "mace_full"): (249, 586),
-    ("CartPole-v1", "ppo"): (140, 660),
-    ("CartPole-v1", "mace_fixed"): (120, 620),
-    ("CartPole-v1", "mace_full"): (104, 634),
-    ("HopperBulletEnv-v0", "ppo"): (865, 1841),
-    ("HopperBulletEnv-v0", "mace_fixed"): (782, 1801),
-    ("HopperBulletEnv-v0", "mace_full"): (495, 1799),
-}
 
 PAPER_SETTINGS = {  # Paper, Table 2, in its order, as LaTeX; the optimiser, Adam, is the last
     "actor_learning_rate": "Actor Learning Rate",

@@ -1,0 +1,343 @@
+"""Does what the paper claims hold? A verdict for each claim by the rule in docs/method.md.
+
+A claim is made of parts, each a comparison of two variants; a part holds, fails or is open, and the
+claim is reproduced, contradicted or inconclusive. Everything here was fixed before the study ran.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.results.metrics import Metric, all_metrics, slope
+from mace_rl.results.paper import (
+    ACROBOT,
+    CARTPOLE,
+    ENVIRONMENTS,
+    FIXED,
+    FULL,
+    HOPPER,
+    PAPER_METRICS,
+    PAPER_TABLE1,
+    PPO,
+    VARIANTS,
+)
+from mace_rl.results.statistics import (
+    holm,
+    probability_of_improvement,
+    stratified_comparison,
+)
+
+CORRELATION = "stagnation_correlation"  # of stagnation and the β that follows; over 0
+
+LEVEL = 0.05  # of the corrected p values
+WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
+POWER = 0.8  # of the smallest difference that could have been shown
+
+LITERAL, ROBUST = "as the paper's code measures", "robust"
+
+
+class Part(NamedTuple):
+    """In these environments, on this metric: `variant` is better than `baseline`."""
+
+    environments: tuple[str, ...]  # of several the mean of the differences, as shares of everything
+    metric: str
+    variant: str
+    baseline: str | None  # None: over 0
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What the paper says, and of which parts that is made, by how it is measured."""
+
+    name: str
+    statement: str
+    parts: Mapping[str, tuple[Part, ...]]
+    paper: tuple[str, int] | None = None  # the environment and column of the paper's Table 1
+
+
+def _over_both(variant: str, metric: str, *environments: str) -> tuple[Part, ...]:
+    """`variant` over the two others, in each environment."""
+    others = [name for name in VARIANTS if name != variant]
+    return tuple(Part((env,), metric, variant, other) for env in environments for other in others)
+
+
+def _speed(name: str, environment: str, statement: str, column: int) -> Claim:
+    """A claim that full is the first in a column of the paper's Table 1."""
+    names = [
+        ("sample_efficiency", "sample_efficiency_common"),
+        ("convergence_steps_public_code", "convergence_steps"),
+    ][column]
+    literal, robust = (_over_both(FULL, metric, environment) for metric in names)
+    return Claim(name, statement, {LITERAL: literal, ROBUST: robust}, (environment, column))
+
+
+def _same(parts: tuple[Part, ...]) -> dict[str, tuple[Part, ...]]:
+    return {LITERAL: parts, ROBUST: parts}
+
+
+CLAIMS = (
+    _speed("C1", ACROBOT, "Acrobot: the learned β has the best sample efficiency", 0),
+    _speed("C2", ACROBOT, "Acrobot: the learned β converges first", 1),
+    _speed("C3", HOPPER, "Hopper: the learned β has the best sample efficiency", 0),
+    _speed("C4", HOPPER, "Hopper: the learned β converges first", 1),
+    _speed("C5", CARTPOLE, "CartPole: the learned β has the best sample efficiency", 0),
+    Claim(
+        "C6",
+        "CartPole: the fixed β converges first and ends slightly above the learned one",
+        {
+            how: (
+                *_over_both(FIXED, metric, CARTPOLE),
+                Part((CARTPOLE,), "final_return", FIXED, FULL),
+            )
+            for how, metric in (
+                (LITERAL, "convergence_steps_public_code"),
+                (ROBUST, "convergence_steps"),
+            )
+        },
+        (CARTPOLE, 1),
+    ),
+    Claim(
+        "C7",
+        "Acrobot and Hopper: the learned β ends above both others",
+        _same(_over_both(FULL, "final_return", ACROBOT, HOPPER)),
+    ),
+    Claim(
+        "C8",
+        "Over all environments the learned β outperforms both others",
+        {
+            how: tuple(Part(ENVIRONMENTS, metric, FULL, other) for other in (PPO, FIXED))
+            for how, metric in ((LITERAL, "sample_efficiency"), (ROBUST, "area_under_curve"))
+        },
+    ),
+    Claim(
+        "C9",
+        "β rises when progress stalls and falls when learning advances",
+        _same(tuple(Part((env,), CORRELATION, FULL, None) for env in ENVIRONMENTS)),
+    ),
+    Claim(
+        "C10",
+        "CartPole: the learned β has the steepest initial curve",
+        _same(_over_both(FULL, "early_return", CARTPOLE)),
+    ),
+)
+
+
+@dataclass
+class Finding:
+    """What was found of one part; differences count in the claim's favour."""
+
+    environments: tuple[str, ...]
+    metric: str
+    variant: str
+    baseline: str | None
+    unit: str  # episodes, return, correlation, or a share of everything
+    seeds: int  # in the environment that has fewest
+    difference: float
+    low: float
+    high: float
+    p_value: float
+    probability: float  # that a run of the variant is better than one of the baseline
+    probability_low: float
+    probability_high: float
+    detectable: float  # the smallest difference that these seeds show with a power of `POWER`
+    worth_mentioning: float
+    p_holm: float = np.nan
+    outcome: str = ""  # holds, fails or open
+
+
+def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
+    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
+
+    returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
+    2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
+    """
+    stagnation, following = -slope(returns, window)[:-1], betas[2 * window :]
+    if len(following) < 2 or np.ptp(stagnation) == 0 or np.ptp(following) == 0:
+        return 0.0
+    return float(scipy.stats.spearmanr(stagnation, following).statistic)
+
+
+def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]:
+    """A record per claim: statement, what the paper's table says, verdicts and `Finding`s.
+
+    table: the frame of metrics.csv with a column `CORRELATION`, and with the paper's environments
+    and variants; seeds may differ between environments, not between variants.
+    """
+    found = {
+        how: [[_find(part, table, settings) for part in claim.parts[how]] for claim in CLAIMS]
+        for how in (LITERAL, ROBUST)
+    }
+    records = []
+    for how in found:
+        _judge([finding for findings in found[how] for finding in findings])
+    for number, claim in enumerate(CLAIMS):
+        record: dict[str, Any] = {"claim": claim.name, "statement": claim.statement}
+        record["paper"] = _paper(claim)
+        for how, of_claims in found.items():
+            record[how] = {
+                "verdict": verdict([finding.outcome for finding in of_claims[number]]),
+                "parts": [asdict(finding) for finding in of_claims[number]],
+            }
+        records.append(record)
+    return records
+
+
+def verdict(outcomes: Sequence[str]) -> str:
+    """Of a claim, from what its parts came out as."""
+    if "fails" in outcomes:
+        return "contradicted"
+    return "reproduced" if set(outcomes) == {"holds"} else "inconclusive"
+
+
+def outcome(finding: Finding) -> str:
+    """Of one part, whose `p_holm` is known."""
+    if finding.p_holm < LEVEL:
+        return "holds" if finding.difference > 0 else "fails"
+    return "fails" if finding.high < finding.worth_mentioning else "open"
+
+
+def _judge(findings: list[Finding]) -> None:
+    """Correct the p values of all parts together, and say what each came out as."""
+    corrected = holm([finding.p_value for finding in findings])
+    for finding, p_holm in zip(findings, corrected, strict=True):
+        finding.p_holm = float(p_holm)
+        finding.outcome = outcome(finding)
+
+
+def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
+    """Estimates and test of one part."""
+    metrics = {metric.name: metric for metric in all_metrics(settings)}
+    pairs = [_pair(part, table[table["env"] == env], metrics) for env in part.environments]
+    everything = [_everything(part, table, env, metrics, settings) for env in part.environments]
+    unit = metrics[part.metric].unit if part.metric in metrics else "correlation"
+    if len(pairs) > 1:
+        pairs = [(x / all_, y / all_) for (x, y), all_ in zip(pairs, everything, strict=True)]
+        everything, unit = [1.0], "share of everything"
+    differences = [x - y for x, y in pairs]
+    how = settings.confidence, settings.bootstrap_repetitions
+    compared = stratified_comparison(
+        differences, *how, np.random.default_rng(settings.bootstrap_seed)
+    )
+    chance = probability_of_improvement(pairs, *how, np.random.default_rng(settings.bootstrap_seed))
+    return Finding(
+        *part,
+        unit,
+        min(len(difference) for difference in differences),
+        *compared,
+        *chance,
+        _detectable(differences, settings.confidence),
+        WORTH_MENTIONING * everything[0],
+    )
+
+
+def _pair(
+    part: Part, runs: pd.DataFrame, metrics: Mapping[str, Metric]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The metric of both variants, [seeds] each, in the order of seeds; greater is better."""
+    episodes = part.metric in metrics and metrics[part.metric].unit == "episodes"
+    wide = runs.pivot(index="seed", columns="variant", values=part.metric).astype(np.float64)
+    variant = wide[part.variant].dropna().to_numpy()
+    baseline = np.zeros_like(variant)
+    if part.baseline is not None:
+        both = wide[[part.variant, part.baseline]].dropna(how="all")
+        if both.isna().any(axis=None):
+            raise ValueError(f"{part.variant} and {part.baseline} do not have the same seeds")
+        variant, baseline = both.to_numpy().T
+    return (-variant, -baseline) if episodes else (variant, baseline)
+
+
+def _everything(
+    part: Part,
+    table: pd.DataFrame,
+    environment: str,
+    metrics: Mapping[str, Metric],
+    settings: MetricsConfig,
+) -> float:
+    """All that a difference could be."""
+    if part.metric == CORRELATION:
+        return 1.0
+    if metrics[part.metric].unit == "episodes":
+        return float(table.loc[table["env"] == environment, "episodes"].min())
+    return settings.reference_return[environment] - settings.random_return_in(environment)
+
+
+def _detectable(differences: Sequence[np.ndarray], confidence: float) -> float:
+    """The smallest mean difference that is significant with a probability of `POWER`."""
+    freedom = sum(len(values) - 1 for values in differences)
+    if freedom == 0:
+        return np.nan
+    variances = [np.var(values, ddof=1) / len(values) for values in differences]
+    error = np.sqrt(np.sum(variances)) / len(differences)
+    quantiles = scipy.stats.t.ppf([(1 + confidence) / 2, POWER], freedom)
+    return float(quantiles.sum() * error)
+
+
+def _paper(claim: Claim) -> str:
+    """What the paper's own table says of a claim; empty where it says nothing."""
+    if claim.paper is None:
+        return ""
+    environment, column = claim.paper
+    values = {name: PAPER_TABLE1[environment, name][column] for name in VARIANTS}
+    first = min(values, key=values.__getitem__)
+    names = {PPO: "PPO", FIXED: "fixed", FULL: "full"}
+    numbers = ", ".join(f"{names[name]} {value}" for name, value in values.items())
+    return f"{PAPER_METRICS[column]}: {numbers}; the best is {names[first]}"
+
+
+def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:
+    """The ledger to read: a table of verdicts, then every part; `origin` says how it was made."""
+    lines = [
+        "# Does it hold?",
+        "",
+        f"{origin} The rule of the verdicts: docs/method.md.",
+        "",
+        f"| | claim | {LITERAL} | {ROBUST} | the paper's Table 1 |",
+        "|---|---|---|---|---|",
+    ]
+    for record in records:
+        verdicts = " | ".join(f"**{record[how]['verdict']}**" for how in (LITERAL, ROBUST))
+        lines.append(
+            f"| {record['claim']} | {record['statement']} | {verdicts} | {record['paper']} |"
+        )
+    for how in (LITERAL, ROBUST):
+        lines += [
+            "",
+            f"## Part by part: {how}",
+            "",
+            "Differences count in the claim's favour. *Detectable*: the smallest that these seeds"
+            f" show with a power of {POWER:.0%}. *P*: that a run of the first is better.",
+            "",
+            "| | environment | metric | over | n | difference | p (Holm) | P | detectable | |",
+            "|---|---|---|---|---|---|---|---|---|---|",
+        ]
+        for record in records:
+            for part in record[how]["parts"]:
+                lines.append(f"| {record['claim']} | {_row(part)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _row(part: Mapping[str, Any]) -> str:
+    """One part, as cells."""
+    digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+    difference, low, high, detectable = (
+        f"{part[name]:.{digits}f}" for name in ("difference", "low", "high", "detectable")
+    )
+    chance = [f"{part[f'probability{end}']:.2f}" for end in ("", "_low", "_high")]
+    return " | ".join(
+        [
+            ", ".join(part["environments"]),
+            part["metric"],
+            f"{part['variant']} over {part['baseline'] or '0'}",
+            str(part["seeds"]),
+            f"{difference} ({low} to {high})",
+            f"{part['p_holm']:.3f}",
+            f"{chance[0]} ({chance[1]} to {chance[2]})",
+            detectable,
+            part["outcome"],
+        ]
+    )

@@ -1,0 +1,144 @@
+"""The verdicts on the paper's claims, from tables in which the truth is known."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from mace_rl.config.study import Study
+from mace_rl.results import claims
+from mace_rl.results.claims import CLAIMS, CORRELATION, LITERAL, ROBUST
+from mace_rl.results.statistics import paired_comparison, stratified_comparison
+
+EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
+LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
+
+
+def table(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:
+    """metrics.csv in which a variant is better by `advantage` of everything, in all it does."""
+    draws = np.random.default_rng(1)
+    rows = []
+    for env, variant, seed in itertools.product(
+        EPISODES, ("ppo", "mace_fixed", "mace_full"), range(seeds)
+    ):
+        row: dict[str, object] = {"env": env, "variant": variant, "seed": seed}
+        row["episodes"] = EPISODES[env]
+        for name in (
+            "sample_efficiency",
+            "sample_efficiency_common",
+            "convergence_steps",
+            "convergence_steps_public_code",
+        ):
+            share = 0.5 - advantage[variant] + noise * draws.normal()
+            row[name] = round(share * EPISODES[env])
+        for name in ("final_return", "area_under_curve", "early_return"):
+            share = 0.5 + advantage[variant] + noise * draws.normal()
+            row[name] = share * LEARNED[env]
+            if env == "Acrobot-v1":
+                row[name] = -500 + share * 415
+        if variant == "mace_full":
+            row[CORRELATION] = advantage[variant] + noise * draws.normal()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def verdicts(frame: pd.DataFrame, study: Study) -> dict[str, tuple[str, str]]:
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    records = claims.ledger(frame, settings)
+    return {
+        record["claim"]: (record[LITERAL]["verdict"], record[ROBUST]["verdict"])
+        for record in records
+    }
+
+
+def test_what_is_plainly_so_is_reproduced(study: Study) -> None:
+    frame = table(20, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
+    expected = dict.fromkeys((claim.name for claim in CLAIMS), ("reproduced",) * 2)
+    assert verdicts(frame, study) == expected | {"C6": ("contradicted",) * 2}
+
+
+def test_fixed_first_is_what_one_claim_wants(study: Study) -> None:
+    frame = table(20, {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}, noise=0.02)
+    found = verdicts(frame, study)
+    assert found["C6"] == ("reproduced", "reproduced")
+    assert found["C9"] == ("reproduced", "reproduced")  # asks nothing of the others
+    assert {found[f"C{n}"][0] for n in (1, 2, 3, 4, 5, 7, 8, 10)} == {"contradicted"}
+
+
+def test_no_difference_worth_mentioning_contradicts_and_too_few_seeds_decide_nothing(
+    study: Study,
+) -> None:
+    equal = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
+    many = verdicts(table(20, equal, noise=0.02), study)
+    assert set(many.values()) == {("contradicted", "contradicted")}
+    few = verdicts(table(3, equal, noise=0.3), study)
+    undecided = sum(both.count("inconclusive") for both in few.values())
+    assert undecided >= 16  # of 20: an interval of 95 % may be wrong
+
+
+def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
+    frame = table(12, {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}, noise=0.1)
+    part = claims.ledger(frame, study.metrics)[0][ROBUST]["parts"][0]
+    assert (part["variant"], part["baseline"]) == ("mace_full", "ppo")
+    runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])[
+        "sample_efficiency_common"
+    ]
+    gain = runs["ppo"] - runs["mace_full"]  # fewer episodes are the improvement
+    assert part["difference"] == pytest.approx(gain.mean())
+    assert part["worth_mentioning"] == 100
+    error = gain.std() / np.sqrt(12)
+    t = scipy.stats.t(11)
+    assert part["detectable"] == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * error)
+    wins = np.mean([x < y for x in runs["mace_full"] for y in runs["ppo"]])
+    ties = np.mean([x == y for x in runs["mace_full"] for y in runs["ppo"]])
+    assert part["probability"] == pytest.approx(wins + ties / 2)
+    # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
+    assert part["p_value"] <= part["p_holm"] <= min(1, 24 * part["p_value"])
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "expected"),
+    [
+        (["holds", "holds"], "reproduced"),
+        (["holds", "open"], "inconclusive"),
+        (["open"], "inconclusive"),
+        (["holds", "fails"], "contradicted"),
+        (["open", "fails"], "contradicted"),
+    ],
+)
+def test_verdict(outcomes: list[str], expected: str) -> None:
+    assert claims.verdict(outcomes) == expected
+
+
+def test_seeds_have_to_be_the_same(study: Study) -> None:
+    frame = table(5, dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0), noise=0.1)
+    frame = frame[~((frame["variant"] == "ppo") & (frame["seed"] == 3))]
+    with pytest.raises(ValueError, match="do not have the same seeds"):
+        claims.ledger(frame, study.metrics)
+
+
+def test_stagnation_correlation() -> None:
+    returns = np.concatenate([np.arange(200.0), np.full(200, 200.0), 200 + 2 * np.arange(200.0)])
+    rising = np.gradient(np.convolve(returns, np.ones(100) / 100, "full")[: len(returns)])
+    assert claims.stagnation_correlation(returns, 0.4 - 0.1 * rising, 50) > 0.9
+    assert claims.stagnation_correlation(returns, 0.4 + 0.1 * rising, 50) < -0.9
+    assert claims.stagnation_correlation(returns, np.full(len(returns), 0.4), 50) == 0
+
+
+def test_stratified_comparison() -> None:
+    draws = np.random.default_rng(0)
+    strata = [draws.normal(1.0, 1, 20), draws.normal(0.2, 3, 12)]
+    found = stratified_comparison(strata, 0.95, 10_000, np.random.default_rng(0))
+    means = [values.mean() for values in strata]
+    assert found.difference == pytest.approx(np.mean(means))
+    errors = [values.std() / np.sqrt(len(values)) for values in strata]
+    half = 1.96 * np.hypot(*errors) / 2
+    assert found.low == pytest.approx(found.difference - half, abs=0.1 * half)
+    assert found.high == pytest.approx(found.difference + half, abs=0.1 * half)
+    signs = [draws.choice([-1, 1], (20_000, len(values))) for values in strata]
+    flipped = np.mean([(s * v).mean(axis=1) for s, v in zip(signs, strata, strict=True)], axis=0)
+    assert found.p_value == pytest.approx(np.mean(abs(flipped) >= found.difference), abs=0.02)
+    one = paired_comparison(strata[0], np.zeros(20), 0.95, 1000, np.random.default_rng(3))
+    assert stratified_comparison(strata[:1], 0.95, 1000, np.random.default_rng(3)) == one

@@ -1,0 +1,41 @@
+"""The claim ledger: what of the paper holds, by the rule in docs/method.md."""
+
+from job import job
+
+with job("claims", snakemake.log[0]):
+    import json
+    from pathlib import Path
+
+    from mace_rl.config.results import MetricsConfig
+    from mace_rl.files import write_atomically
+    from mace_rl.results import claims
+    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.paper import FULL
+    from mace_rl.results.records import read_episodes
+    from mace_rl.runs.provenance import read_record
+
+    params = snakemake.params
+    settings = MetricsConfig.model_validate(params.settings)
+    table = read_metrics(
+        snakemake.input.metrics, params.environments, params.variants, params.seeds, settings
+    )
+    correlations = {}
+    for path, (env, variant, seed, episodes) in zip(
+        snakemake.input.episodes, params.runs, strict=True
+    ):
+        if variant == FULL:
+            frame = read_episodes(path, episodes)
+            correlations[env, variant, seed] = claims.stagnation_correlation(
+                frame["extrinsic_return"].to_numpy(),
+                frame["beta"].to_numpy(),
+                settings.moving_average,
+            )
+    runs = zip(table["env"], table["variant"], table["seed"], strict=True)
+    table[claims.CORRELATION] = [correlations.get(run, float("nan")) for run in runs]
+    ledger = claims.ledger(table, settings)
+    seconds = sum(read_record(Path(path))["seconds"] for path in snakemake.input.records)
+    cost = {"command": params.command, "runs": len(table), "core_hours": seconds / 3600}
+    text = json.dumps({"cost": cost, "claims": ledger}, indent=2, ensure_ascii=False)
+    write_atomically(snakemake.output.json, text + "\n")
+    origin = f"`{cost['command']}`: {cost['runs']} runs, {cost['core_hours']:.1f} core-hours."
+    write_atomically(snakemake.output.markdown, claims.markdown(ledger, origin))
