@@ -19,8 +19,7 @@ from mace_rl.agent.ppo import PPO
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.progress import FAST, IMPROVEMENT, SLOW, Progress
-from mace_rl.beta.schedule import ExponentialSchedule
-from mace_rl.config.run import ExponentialBeta, RunConfig
+from mace_rl.config.run import RunConfig
 from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.experience import Experience
@@ -74,31 +73,6 @@ def learnt(monkeypatch) -> list[np.ndarray]:
 
     monkeypatch.setattr(Adam, "step", note)
     return gradients
-
-
-# --- The schedule -------------------------------------------------------------------------------
-
-
-def test_exponential_schedule_by_hand():
-    config = ExponentialBeta(kind="exponential", initial=0.4, decay=0.5, floor=0.06)
-    schedule = ExponentialSchedule(config)
-    betas = []
-    for _ in range(6):
-        betas.append(schedule.beta)
-        schedule.next_episode(None, None)
-    assert betas == pytest.approx([0.4, 0.2, 0.1, 0.06, 0.06, 0.06])
-    assert not schedule.learns
-
-
-def test_the_paper_s_schedules_start_where_the_variant_says(run_config):
-    for variant, initial in (("mace_fixed", 0.4), ("mace_fixed_0.2", 0.2), ("mace_fixed_0.6", 0.6)):
-        schedule = ExponentialSchedule(run_config("CartPole-v1", variant).beta)
-        assert schedule.beta == initial
-        for _ in range(1000):
-            schedule.next_episode(None, None)
-        assert schedule.beta == pytest.approx(initial * math.exp(1000 * math.log(0.999)))
-        schedule.load_state_dict({"episodes": 100_000})
-        assert schedule.beta == 0.01
 
 
 # --- What the network is asked for --------------------------------------------------------------

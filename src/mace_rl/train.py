@@ -113,8 +113,7 @@ class Trainer:
             intrinsic = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
             )
-            unit = self.ppo.reward_scales["extrinsic"].value if self.config.ppo.scale_rewards else 1
-            self.curiosity.remember(episode, extrinsic[1] * unit)
+            self.curiosity.remember(episode, extrinsic[1] * self.ppo.reward_scale("extrinsic"))
             self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(

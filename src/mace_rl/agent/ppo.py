@@ -199,7 +199,7 @@ class PPO:
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
-            rewards = rewards / self.reward_scales[kind].value
+            rewards = rewards / self.reward_scale(kind)
         values = self.critics[kind].values(observations)
         if terminated:
             values[-1] = 0.0
@@ -208,6 +208,10 @@ class PPO:
         )
         self.advantage_scales[kind].update(advantages)
         return advantages, advantages + values[:-1]
+
+    def reward_scale(self, kind: str) -> float:
+        """The unit of rewards, advantages and returns of one kind, in what was paid."""
+        return self.reward_scales[kind].value if self.config.scale_rewards else 1.0
 
     def advantage_scale(self, kind: str) -> float:
         """What advantages of one kind are divided by before β weighs them."""
