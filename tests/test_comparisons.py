@@ -179,6 +179,18 @@ def test_the_regret_of_equals_errs_upward():
     assert np.mean(regrets) > 2 * scipy.stats.sem(regrets)
 
 
+def test_environments_may_have_different_seeds():
+    _, frame = regret_of(noise=30)
+    fewer = frame[(frame["env"] != "Acrobot-v1") | (frame["seed"] < 5)]
+    settings = SETTINGS.model_copy(
+        update={"regret": RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])}
+    )
+    found = regret(fewer, settings).set_index("env")
+    assert found["seeds"].to_dict() == {"CartPole-v1": 8, "Acrobot-v1": 5, "all": 5}
+    both = found.loc[["CartPole-v1", "Acrobot-v1"], "regret"].mean()
+    assert found.loc["all", "regret"] == pytest.approx(both)
+
+
 def test_regret_without_a_constant_that_beats_random_is_nan():
     constants = dict.fromkeys(("ppo", "mace_fixed", "low"), -600.0)
     result, _ = regret_of(**constants)

@@ -61,6 +61,7 @@ ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
 }
 COLUMNS = list(ROW)
 ENVIRONMENTS, VARIANTS, SEEDS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_full"], [3, 1]
+WANTED = list(product(ENVIRONMENTS, VARIANTS, SEEDS))
 
 
 def ramp(flat_before, rise, flat_after):
@@ -357,8 +358,7 @@ def runs():
 
 
 def table(**changed):
-    arguments = {"runs": runs(), "environments": ENVIRONMENTS, "variants": VARIANTS}
-    return m.metrics_table(**arguments | {"seeds": SEEDS, "settings": CONFIG} | changed)
+    return m.metrics_table(**{"runs": runs(), "wanted": WANTED, "settings": CONFIG} | changed)
 
 
 def test_a_row_holds_each_metric_under_its_name():
@@ -371,7 +371,7 @@ def test_a_row_holds_each_metric_under_its_name():
 def test_the_table_is_in_the_configured_order_and_counts_censored_runs():
     result = table()
     found = list(zip(result["env"], result["variant"], result["seed"], strict=True))
-    assert found == list(product(ENVIRONMENTS, VARIANTS, SEEDS))
+    assert found == WANTED
     assert not result.isna().any(axis=None)
     acrobot = result[result["env"] == "Acrobot-v1"]
     assert (acrobot["sample_efficiency_censored"] == 1).all()  # the bar is above the final return
@@ -384,7 +384,7 @@ def test_a_missing_run_is_an_error_and_never_a_smaller_n():
     with pytest.raises(RecordError, match="the run Acrobot-v1, ppo, seed 1 is missing"):
         table(runs=fewer)
     with pytest.raises(RecordError, match="seed 1 in the records is not in the configuration"):
-        table(seeds=[3])
+        table(wanted=[run for run in WANTED if run[2] == 3])
     shorter = runs()
     shorter["Acrobot-v1", "ppo", 1] = frame(noisy(0, 399))
     with pytest.raises(RecordError, match=r"Acrobot-v1, ppo have different .* \[399, 400\]"):
@@ -424,7 +424,7 @@ def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
     spoil(lines)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordError, match=named) as refusal:
-        m.read_metrics(path, ENVIRONMENTS, VARIANTS, SEEDS, CONFIG)
+        m.read_metrics(path, WANTED, CONFIG)
     assert str(path) in str(refusal.value)
 
 
@@ -459,10 +459,10 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
         first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
         assert tuple(row) == (first or 400, min(returns), first is None)
     result.to_csv(tmp_path / "metrics.csv", index=False)
-    read = m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS, settings)
+    read = m.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
     pd.testing.assert_frame_equal(read, result, check_exact=True)
     with pytest.raises(RecordError, match="line 1: the column 'positive'"):
-        m.read_metrics(tmp_path / "metrics.csv", ENVIRONMENTS, VARIANTS, SEEDS, CONFIG)
+        m.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
 
 
 @pytest.mark.parametrize(

@@ -215,6 +215,20 @@ def test_run_config_of_a_run_outside_the_lists() -> None:
             study.run_config(*arguments)
 
 
+def test_an_environment_may_have_seeds_of_its_own(tmp_path: Path) -> None:
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text(
+        "environments: [Acrobot-v1, HopperBulletEnv-v0]\nvariants: [ppo]\nseeds: [8, 9]\n"
+        "environment_seeds: {HopperBulletEnv-v0: [3]}\n"
+    )
+    runs = read_study([CONFIG, overlay]).runs()
+    short = [("Acrobot-v1", "ppo", 8), ("Acrobot-v1", "ppo", 9)]
+    assert runs == [*short, ("HopperBulletEnv-v0", "ppo", 3)]
+    overlay.write_text("environment_seeds: {HopperBulletEnvv0: [3]}\n")
+    with pytest.raises(ConfigError, match=r"environment_seeds has 'HopperBulletEnvv0'.*nearest"):
+        read_study([CONFIG, overlay])
+
+
 def test_files_are_read_over_one_another(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.yaml"
     overlay.write_text("seeds: [8, 9]\ntraining: {ppo: {clip: 0.3}}\n")

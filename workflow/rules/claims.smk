@@ -12,9 +12,6 @@ rule claims:
     log:
         f"{RESULTS}/logs/claims.log",
     params:
-        environments=study.environments,
-        variants=study.variants,
-        seeds=study.seeds,
         runs=BUDGETS,
         settings=MEASURED.model_dump(),
         command="snakemake all"

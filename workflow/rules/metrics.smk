@@ -18,9 +18,6 @@ rule metrics:
         f"{RESULTS}/logs/metrics.log",
     params:
         runs=BUDGETS,
-        environments=study.environments,
-        variants=study.variants,
-        seeds=study.seeds,
         settings=MEASURED.model_dump(),
         code=code("metrics.py", MEASURED),
     script:

@@ -5,7 +5,6 @@ import re
 import shlex
 import sys
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import gymnasium
@@ -34,7 +33,7 @@ except ConfigError as error:
 
 RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
-RUNS = list(product(study.environments, study.variants, study.seeds))
+RUNS = study.runs()
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
 # The claim ledger is for a study that has all the paper makes claims of.
 TESTS_CLAIMS = (
@@ -54,7 +53,7 @@ def one_of(values):
 wildcard_constraints:
     env=one_of(study.environments),
     variant=one_of(study.variants),
-    seed=one_of(study.seeds),
+    seed=one_of({seed: None for _, _, seed in RUNS}),
 
 
 def run_config(wildcards):

@@ -16,9 +16,7 @@ rule table1:
     log:
         f"{RESULTS}/logs/table1.log",
     params:
-        environments=study.environments,
-        variants=study.variants,
-        seeds=study.seeds,
+        runs=BUDGETS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
         code=code("table1.py", MEASURED),
@@ -51,9 +49,7 @@ rule comparisons:
     log:
         f"{RESULTS}/logs/comparisons.log",
     params:
-        environments=study.environments,
-        variants=study.variants,
-        seeds=study.seeds,
+        runs=BUDGETS,
         settings=MEASURED.model_dump(),
         code=code("comparisons.py", MEASURED),
     script:

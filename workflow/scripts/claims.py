@@ -16,9 +16,7 @@ with job("claims", snakemake.log[0]):
 
     params = snakemake.params
     settings = MetricsConfig.model_validate(params.settings)
-    table = read_metrics(
-        snakemake.input.metrics, params.environments, params.variants, params.seeds, settings
-    )
+    table = read_metrics(snakemake.input.metrics, [tuple(run[:3]) for run in params.runs], settings)
     correlations = {}
     for path, (env, variant, seed, episodes) in zip(
         snakemake.input.episodes, params.runs, strict=True

@@ -10,9 +10,7 @@ with job("comparisons", snakemake.log[0]):
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    metrics = read_metrics(
-        snakemake.input[0], params.environments, params.variants, params.seeds, settings
-    )
+    metrics = read_metrics(snakemake.input[0], [tuple(run[:3]) for run in params.runs], settings)
     write_atomically(output.comparisons, comparisons(metrics, settings).to_csv(index=False))
     if settings.regret:
         write_atomically(output.regret, regret(metrics, settings).to_csv(index=False))

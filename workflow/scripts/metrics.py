@@ -13,11 +13,6 @@ with job("metrics", snakemake.log[0]):
         (env, variant, seed): read_episodes(path, episodes)
         for path, (env, variant, seed, episodes) in zip(snakemake.input, params.runs, strict=True)
     }
-    table = metrics_table(
-        runs,
-        params.environments,
-        params.variants,
-        params.seeds,
-        MetricsConfig.model_validate(params.settings),
-    )
+    wanted = [tuple(run[:3]) for run in params.runs]
+    table = metrics_table(runs, wanted, MetricsConfig.model_validate(params.settings))
     write_atomically(snakemake.output[0], table.to_csv(index=False))

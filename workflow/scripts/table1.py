@@ -10,9 +10,7 @@ with job("Table 1", snakemake.log[0]):
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    metrics = read_metrics(
-        snakemake.input[0], params.environments, params.variants, params.seeds, settings
-    )
+    metrics = read_metrics(snakemake.input[0], [tuple(run[:3]) for run in params.runs], settings)
     for name, data, latex in (
         ("table1", tables.table1, tables.table1_latex),
         ("supplement", tables.supplement, tables.supplement_latex),

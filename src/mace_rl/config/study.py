@@ -78,15 +78,20 @@ class Variant(Section):
         return dict(self.model_extra or {})
 
 
+Seeds = Annotated[
+    list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_once)
+]
+
+
 class Study(Section):
-    """All runs of a study, every environment × variant × seed, and how they are evaluated."""
+    """All runs of a study, each environment × variant × seed, and how they are evaluated."""
 
     results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
     environments: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
     variants: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
-    seeds: Annotated[
-        list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_once)
-    ]
+    seeds: Seeds
+    # Other seeds for some environments, where one run takes long.
+    environment_seeds: dict[str, Seeds] = Field(default={})
     training: Settings  # hyperparameters of every run ...
     environment_settings: dict[str, Settings]  # ... changed for an environment ...
     variant_settings: dict[Annotated[str, AfterValidator(_name)], Variant]  # ... and for a variant
@@ -102,6 +107,15 @@ class Study(Section):
             for environment in environments
             for variant in self.variant_settings
         }
+
+    def runs(self) -> list[tuple[str, str, int]]:
+        """Environment, variant and seed of every run, in the configured order."""
+        return [
+            (environment, variant, seed)
+            for environment in self.environments
+            for variant in self.variants
+            for seed in self.environment_seeds.get(environment, self.seeds)
+        ]
 
     @property
     def labels(self) -> dict[str, str]:
@@ -155,6 +169,8 @@ def load_study(config: Any, origin: str) -> Study:
             _check_name(environment, key)
             for variant in study.variant_settings:  # every run's settings are checked here
                 _check_environment(study._combinations[environment, variant], key)
+        for environment in study.environment_seeds:
+            _check_known(environment, known, "environment_seeds", "environments")
         for environment in study.environments:
             study.metrics.random_return_in(environment)  # there has to be one
         for reference in study.metrics.custom:

@@ -26,7 +26,7 @@ class Comparison(NamedTuple):
     metric: str
     variant: str
     baseline: str
-    seeds: int
+    seeds: int  # of all environments, in that which has fewest
     censored: int  # runs of both that never got there
     difference: float  # mean of variant - baseline; of episodes, of restricted means
     low: float  # of its interval, of differences paired by seed
@@ -96,9 +96,8 @@ def _compare(
         [(sign * x, sign * y) for x, y in restricted], *how, np.random.default_rng(seed)
     )
     censored = sum(int(np.isinf(values).sum()) for both in reached for values in both)
-    row = Comparison(
-        ALL, metric.name, *pair, len(reached[0][0]), censored, *UNTESTED, np.nan, *better
-    )
+    fewest = min(len(both[0]) for both in reached)
+    row = Comparison(ALL, metric.name, *pair, fewest, censored, *UNTESTED, np.nan, *better)
     if len(runs) > 1:
         return row
     compared = paired_comparison(*restricted[0], *how, np.random.default_rng(seed))
@@ -150,15 +149,20 @@ def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 def _regret(
     areas: list[np.ndarray], randoms: list[float], settings: MetricsConfig
 ) -> tuple[float, float, float, int]:
-    """Mean regret, its interval and the seeds, from [seeds, 1 + constants] of each environment."""
-    generator, seeds = np.random.default_rng(settings.bootstrap_seed), len(areas[0])
+    """Mean regret, its interval and the seeds, from [seeds, 1 + constants] of each environment.
+
+    The seeds are those of the environment that has fewest.
+    """
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    fewest = min(len(area) for area in areas)
     regrets = []  # of each environment: [repetitions + 1], the seeds as they are first
     for area, random in zip(areas, randoms, strict=True):
+        seeds = len(area)
         drawn = generator.integers(seeds, size=(settings.bootstrap_repetitions, seeds))
         means = area[np.vstack([np.arange(seeds), drawn])].mean(axis=1)
         best = means[:, 1:].max(axis=1)
         regrets.append((best - means[:, 0]) / np.where(best > random, best - random, np.nan))
     mean, *resampled = np.mean(regrets, axis=0)
-    if seeds == 1:
-        return mean, np.nan, np.nan, seeds
-    return mean, *percentiles(np.array(resampled), settings.confidence), seeds
+    if fewest == 1:
+        return mean, np.nan, np.nan, fewest
+    return mean, *percentiles(np.array(resampled), settings.confidence), fewest

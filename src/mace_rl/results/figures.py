@@ -170,7 +170,7 @@ def draw_figure(
             *panels[0].get_legend_handles_labels(),
             loc="outside lower center",
             ncols=min(len(variants), 3),
-            title=_explanation(curves["n"].max(), confidence),
+            title=_explanation(curves["n"].min(), curves["n"].max(), confidence),
         )
         for line in legend.get_lines():
             line.set_linewidth(2)
@@ -223,9 +223,10 @@ def _select(frame: "pd.DataFrame", environment: str, variant: str) -> "pd.DataFr
     return frame[(frame["env"] == environment) & (frame["variant"] == variant)]
 
 
-def _explanation(seeds: int, confidence: float) -> str:
+def _explanation(fewest: int, seeds: int, confidence: float) -> str:
     """The legend's title: what lines and bands are."""
     if seeds == 1:
         return "One seed"
+    count = f"{seeds}" if fewest == seeds else f"{fewest} to {seeds}"
     band = f" Band: its {100 * confidence:g} % interval." if seeds >= BAND_SEEDS else ""
-    return f"Line: mean over {seeds} seeds.{band} Faint lines: single seeds."
+    return f"Line: mean over {count} seeds.{band} Faint lines: single seeds."

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import product
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -328,20 +327,15 @@ def metrics_of_run(
 
 
 def metrics_table(
-    runs: Mapping[RunKey, "pd.DataFrame"],
-    environments: Sequence[str],
-    variants: Sequence[str],
-    seeds: Sequence[int],
-    settings: MetricsConfig,
+    runs: Mapping[RunKey, "pd.DataFrame"], wanted: Sequence[RunKey], settings: MetricsConfig
 ) -> "pd.DataFrame":
-    """One row of `metrics_columns` per run, in the configured order.
+    """One row of `metrics_columns` per run, in the order of `wanted`.
 
-    Raises `RecordError` unless `runs` holds exactly every environment, variant and seed, and
-    `ConfigError` for metrics that cannot be.
+    Raises `RecordError` unless `runs` holds exactly these, and `ConfigError` for metrics that
+    cannot be.
     """
     import pandas as pd
 
-    wanted = list(product(environments, variants, seeds))
     _check_runs("the records", runs, wanted)
     table = pd.DataFrame([metrics_of_run(runs[run], run, settings) for run in wanted])
     _check_attained("the table of metrics", table, all_metrics(settings))
@@ -350,17 +344,12 @@ def metrics_table(
 
 
 def read_metrics(
-    path: str | Path,
-    environments: Sequence[str],
-    variants: Sequence[str],
-    seeds: Sequence[int],
-    settings: MetricsConfig,
+    path: str | Path, wanted: Sequence[RunKey], settings: MetricsConfig
 ) -> "pd.DataFrame":
-    """Read metrics.csv; `RecordError` unless it is `metrics_table` of exactly these runs."""
+    """Read metrics.csv; `RecordError` unless it is `metrics_table` of exactly the `wanted` runs."""
     metrics = all_metrics(settings)
     table = read_table(path, metrics_columns(metrics))
     found = list(zip(table["env"], table["variant"], table["seed"].tolist(), strict=True))
-    wanted = list(product(environments, variants, seeds))
     _check_runs(str(path), found, wanted)
     for line, (run, right) in enumerate(zip(found, wanted, strict=True), start=2):
         if run != right:

@@ -292,6 +292,7 @@ def _interval(row: Any, digits: int = 0) -> str:
 def _how(table: pd.DataFrame, confidence: float) -> str:
     """The part of a caption that says from what the numbers come."""
     seeds = table["seeds"].min()
+    count = _from_to(table["seeds"])
     budgets: dict[str, list[str]] = {}
     for environment, group in table.groupby("env", sort=False):
         budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
@@ -305,7 +306,7 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     text = (
         "One seed, which allows no interval."
         if seeds == 1
-        else f"Means over {seeds} seeds and, below, their {level}\\,\\% {kind} intervals."
+        else f"Means over {count} seeds and, below, their {level}\\,\\% {kind} intervals."
     )
     text += f" Training budget: {budget}."
     if table["censored"].any():
@@ -314,6 +315,12 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
             " a lower bound."
         )
     return text
+
+
+def _from_to(counts: pd.Series) -> str:
+    """A number, or from which to which."""
+    low, high = counts.min(), counts.max()
+    return str(low) if low == high else f"{low} to {high}"
 
 
 def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str:
