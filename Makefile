@@ -21,7 +21,7 @@ SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick bench verify kill-test lint lock audit clean help setup
+.PHONY: all quick test test-quick tables bench verify cross-cpu kill-test lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -35,11 +35,17 @@ test: setup ## every test, on every core
 test-quick: setup ## the tests that take seconds, for the edit loop
 	@$(PYTEST) -m "not slow"
 
+tables: setup ## every table, figure and verdict from the runs in reference/, without training
+	@$(IN_VENV) tools.tables
+
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
 verify: setup ## repeat a sample of the runs in reference/ and compare to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
+
+cross-cpu: setup ## train under emulated processors and compare to the bit (wants qemu-user)
+	@$(IN_VENV) tools.cross_cpu
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
 	@$(IN_VENV) tools.kill_test
