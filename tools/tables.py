@@ -2,9 +2,9 @@
 
     python -m tools.tables [--check]        (make tables)
 
-The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY, the
-outputs that reference/studies.yaml names. They are compared with those in reference/tables. New ones
-are kept there; with --check that one is missing is a mistake too.
+The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
+the outputs that reference/studies.yaml names. They are compared with those in reference/tables.
+New ones are kept there; with --check that one is missing is a mistake too.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def make(name: str, study: dict[str, Any]) -> None:
 
 
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
-    """The outputs of a study that are not those in `EXPECTED`; new ones go there, if not `check`."""
+    """The outputs that are not those in `EXPECTED`; new ones go there, unless `check`."""
     different = []
     for output in outputs:
         made, expected = MADE / name / output, EXPECTED / name / output
