@@ -21,6 +21,7 @@ localrules:
     table1,
     table2,
     comparisons,
+    aggregate,
     curves,
     figure,
 
@@ -33,6 +34,7 @@ rule all:
         f"{RESULTS}/supplement.tex",
         f"{RESULTS}/supplement.csv",
         f"{RESULTS}/comparisons.csv",
+        f"{RESULTS}/aggregate.csv",
         f"{RESULTS}/table2.tex",
         f"{RESULTS}/figure1.pdf",
         f"{RESULTS}/figure1.png",

@@ -165,7 +165,8 @@ def test_the_interval_of_regret_chooses_the_best_constant_anew():
             regrets[name].append((best - means["mace_full"]) / (best - random))
     regrets["all"] = np.mean(list(regrets.values()), axis=0)
     for name, drawn in regrets.items():
-        expected = np.percentile(drawn, [2.5, 97.5])
+        z = np.sqrt(8 / 7) * scipy.stats.t.ppf(0.975, 7)
+        expected = np.quantile(drawn, scipy.stats.norm.cdf([-z, z]))
         found = result.loc[name, ["low", "high"]].astype(float)
         np.testing.assert_allclose(found, expected, atol=0.12 * np.ptp(expected))
 

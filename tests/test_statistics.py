@@ -30,10 +30,15 @@ def test_below_ten_seeds_the_interval_is_students():
     np.testing.assert_allclose(interval(np.array([0.0, 2.0])), (1 - 12.7062, 1 + 12.7062), 1e-4)
 
 
-def test_from_ten_seeds_on_the_interval_is_the_percentile_bootstrap():
+def test_from_ten_seeds_on_the_interval_is_the_expanded_bootstrap():
     assert s.interval_kind(10) == "bootstrap"
     expected = scipy.stats.bootstrap(
-        (TWELVE,), np.mean, n_resamples=REPETITIONS, method="percentile", rng=generator(1)
+        (TWELVE,),
+        np.mean,
+        n_resamples=REPETITIONS,
+        method="percentile",
+        confidence_level=1 - 2 * scipy.stats.norm.cdf(-np.sqrt(12 / 11) * 2.200985),  # t, 11
+        rng=generator(1),
     ).confidence_interval
     np.testing.assert_allclose(interval(TWELVE), expected, atol=0.1)
 
@@ -99,6 +104,13 @@ def test_paired_comparison_at_its_limits():
     assert np.isnan(one[1:]).all()
 
 
+def expanded(resampled: list[float], seeds: int) -> np.ndarray:
+    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
+    factor = scipy.stats.t.ppf(0.975, seeds - 1) / scipy.stats.norm.ppf(0.975)
+    z = scipy.stats.norm.ppf(0.975) * factor * np.sqrt(seeds / (seeds - 1))
+    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))
+
+
 def test_probability_of_improvement_against_a_loop_and_scipy():
     probability, low, high = s.probability_of_improvement(
         [(FIVE, OTHER[:4])], 0.95, REPETITIONS, generator()
@@ -112,11 +124,11 @@ def test_probability_of_improvement_against_a_loop_and_scipy():
     for _ in range(REPETITIONS):
         x, y = draws.choice(FIVE, 5), draws.choice(OTHER[:4], 4)
         resampled.append(np.mean([(a > b) + 0.5 * (a == b) for a in x for b in y]))
-    np.testing.assert_allclose((low, high), np.percentile(resampled, [2.5, 97.5]), atol=0.051)
+    np.testing.assert_allclose((low, high), expanded(resampled, 4), atol=0.051)
 
 
 def test_probability_of_improvement_over_several_environments():
-    pairs = [(FIVE, OTHER), (TWELVE[:4], TWELVE[4:])]
+    pairs = [(TWELVE, TWELVE[::-1] ** 2 / 5), (TWELVE - 1, TWELVE)]
     alone = [s.probability_of_improvement([p], 0.95, REPETITIONS, generator()) for p in pairs]
     probability, low, high = s.probability_of_improvement(pairs, 0.95, REPETITIONS, generator())
     assert probability == pytest.approx(np.mean([one[0] for one in alone]))
@@ -124,7 +136,7 @@ def test_probability_of_improvement_over_several_environments():
     for _ in range(REPETITIONS):  # stratified: every environment's runs among themselves
         drawn = [(draws.choice(x, len(x)), draws.choice(y, len(y))) for x, y in pairs]
         resampled.append(np.mean([np.heaviside(np.subtract.outer(*d), 0.5).mean() for d in drawn]))
-    np.testing.assert_allclose((low, high), np.percentile(resampled, [2.5, 97.5]), atol=0.02)
+    np.testing.assert_allclose((low, high), expanded(resampled, 12), atol=0.03)
 
 
 def test_probability_of_improvement_at_its_limits():

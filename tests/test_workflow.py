@@ -32,12 +32,12 @@ TINY = {  # instead of what config.yaml has
 }
 RUNS = [f"runs/{env}/{variant}/seed0" for env in ENVIRONMENTS for variant in VARIANTS]
 OUTPUTS = [
-    *("metrics.csv", "comparisons.csv", "table1.tex", "table1.csv", "table2.tex"),
+    *("metrics.csv", "comparisons.csv", "aggregate.csv", "table1.tex", "table1.csv", "table2.tex"),
     *("supplement.tex", "supplement.csv", "figure1.csv", "figure1_seeds.csv", "figure2.csv"),
     *("figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"),
     *(f"{run}/{name}" for run in RUNS for name in ("episodes.csv", "diagnostics.csv", "agent.pt")),
 ]
-EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "curves": 2, "figure": 2}
+EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1, "curves": 2, "figure": 2}
 
 
 class Project:

@@ -69,3 +69,20 @@ rule table2:
         code=code("table2.py"),
     script:
         "../scripts/table2.py"
+
+
+rule aggregate:
+    input:
+        f"{RESULTS}/metrics.csv",
+    output:
+        report(
+            f"{RESULTS}/aggregate.csv", caption="../report/aggregate.rst", category="Supplement"
+        ),
+    log:
+        f"{RESULTS}/logs/aggregate.log",
+    params:
+        runs=BUDGETS,
+        settings=MEASURED.model_dump(),
+        code=code("aggregate.py", MEASURED),
+    script:
+        "../scripts/aggregate.py"

@@ -165,4 +165,4 @@ def _regret(
     mean, *resampled = np.mean(regrets, axis=0)
     if fewest == 1:
         return mean, np.nan, np.nan, fewest
-    return mean, *percentiles(np.array(resampled), settings.confidence), fewest
+    return mean, *percentiles(np.array(resampled), settings.confidence, fewest), fewest
