@@ -44,8 +44,8 @@ bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=qui
 verify: setup ## repeat a sample of the runs in reference/ and compare to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 
-cross-cpu: setup ## train under emulated processors and compare to the bit (wants qemu-user)
-	@$(IN_VENV) tools.cross_cpu
+cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
+	@$(IN_VENV) tools.cross_cpu $(if $(filter short,$(CROSS)),--short)
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
 	@$(IN_VENV) tools.kill_test
