@@ -75,9 +75,7 @@ rule aggregate:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        report(
-            f"{RESULTS}/aggregate.csv", caption="../report/aggregate.rst", category="Supplement"
-        ),
+        report(f"{RESULTS}/aggregate.csv", caption="../report/aggregate.rst", category="Supplement"),
     log:
         f"{RESULTS}/logs/aggregate.log",
     params:
