@@ -199,7 +199,7 @@ CHANGES = {  # of a file, from one text to another, and what is to be done then
     "a script": ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
     "a result": (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),
-        {"table1": 1, "comparisons": 1},
+        {"table1": 1, "comparisons": 1, "aggregate": 1},
     ),
 }
 
