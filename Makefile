@@ -50,9 +50,10 @@ cross-cpu: setup ## train under emulated processors and compare to the bit (half
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
 	@$(IN_VENV) tools.kill_test
 
-lint: setup ## check style and workflow
+lint: setup ## check style, types and workflow
 	@$(IN_VENV) ruff check .
 	$(IN_VENV) ruff format --check .
+	$(IN_VENV) mypy
 	$(IN_VENV) snakefmt --check Snakefile workflow
 	$(IN_VENV) tools.lint_workflow
 
@@ -144,7 +145,7 @@ audit: ## known vulnerabilities of what the locks pin (asks a vulnerability serv
 	    --progress-spinner=off -r environment.lock -r environment-cuda.lock
 
 clean: ## remove .venv and caches; never results/ or Snakemake's records
-	@rm -rf .venv setup.log build src/*.egg-info .hypothesis .pytest_cache .ruff_cache
+	@rm -rf .venv setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
 
 help: ## this list

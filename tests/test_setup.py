@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
@@ -25,7 +26,7 @@ MAIN, CUDA = (
     for lock in LOCKS
 )
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-DECLARED = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]
+DECLARED = sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])
 
 
 @pytest.mark.parametrize("lock", LOCKS)
@@ -71,6 +72,19 @@ def test_every_import_is_declared():
         found = re.findall(r"^ *(?:import (\w+)|from (\w+)[\w.]* import )", text, re.MULTILINE)
         for module in {a or b for a, b in found} - own - sys.stdlib_module_names:
             assert declared & {canonicalize_name(n) for n in distributions[module]}, (path, module)
+
+
+def test_whoever_installs_the_package_gets_its_types(tmp_path):
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    shutil.copytree(
+        ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__")
+    )
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*command, "-w", "wheel", "."], cwd=tmp_path, check=True)
+    (wheel,) = (tmp_path / "wheel").iterdir()
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    modules = {str(p.relative_to(ROOT / "src")) for p in (ROOT / "src/mace_rl").rglob("*.py")}
+    assert modules | {"mace_rl/py.typed"} <= packed
 
 
 # --- make, with a Python that only pretends to install ------------------------------------------

@@ -24,7 +24,8 @@ KEPT = (files.EPISODES, files.RECORD)
 def read(archive: Path) -> dict[str, bytes]:
     """What is in an archive, by name."""
     with tarfile.open(archive, "r:xz") as tar:
-        return {member.name: tar.extractfile(member).read() for member in tar.getmembers()}
+        files_in_it = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
+        return {name: file.read() for name, file in files_in_it if file is not None}
 
 
 def write(archive: Path, content: dict[str, bytes]) -> None:

@@ -103,6 +103,7 @@ def train() -> None:
     study = read_study([CONFIG])
     for number, (environment, variant, folder, halt) in enumerate(tasks):
         settings = study.run_config(environment, variant, 0).settings()
+        changes: dict[str, Any]
         changes = {section: values for section, values in CHANGES.items() if section in settings}
         changes |= {"engine": engine, "episodes": EPISODES[environment]}
         config = check(RunConfig, merge_layers(settings, changes), "tools/cross_cpu.py")
@@ -120,6 +121,7 @@ def begin(run: Any, config: Any, folder: Path) -> None:
         if progress["episode"] > config.episodes // 2:
             raise Interrupted
 
+    every_round: dict[str, Any]
     every_round = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "OBSERVER_SECONDS": 0.0}
     try:
         with patch.multiple(run, **every_round):
@@ -152,6 +154,7 @@ def carry_out(
             env=os.environ | {"NUMBA_CACHE_DIR": str(scratch / "numba" / processor)},
         ) as process,
     ):
+        assert process.stdout is not None  # a pipe, as asked for
         try:
             for line in process.stdout:
                 if number := re.fullmatch(r"finished (\d+)\n", line):

@@ -17,8 +17,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from mace_rl import files
 
@@ -32,7 +34,7 @@ TRAIN += "from mace_rl.cli import main; main()"
 RESULTS = {*files.RESULTS, files.RECORD}
 
 
-def start(environment: str, variant: str, folder: Path) -> subprocess.Popen:
+def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[bytes]:
     """Begin a training in `folder`, in a process of its own."""
     command = [sys.executable, "-c", TRAIN, "train", "--env", environment, "--variant", variant]
     command += ["--seed", "0", "--episodes", str(EPISODES[environment]), "--out", str(folder)]
@@ -41,7 +43,7 @@ def start(environment: str, variant: str, folder: Path) -> subprocess.Popen:
     )
 
 
-def finish(process: subprocess.Popen) -> None:
+def finish(process: subprocess.Popen[bytes]) -> None:
     """Wait for a training; exit with what it said if it failed."""
     _, error = process.communicate()
     if process.returncode != 0:
@@ -74,7 +76,7 @@ def writing_results(folder: Path) -> bool:
 
 
 def kill_when(
-    process: subprocess.Popen, folder: Path, moment: Callable[[Path], bool], delay: float
+    process: subprocess.Popen[bytes], folder: Path, moment: Callable[[Path], bool], delay: float
 ) -> bool:
     """SIGKILL `process` `delay` seconds after `moment` came; False if it ended before."""
     while process.poll() is None:
@@ -105,8 +107,8 @@ def kill_trainings(scratch: Path, repeats: int, generator: random.Random) -> lis
         training = time.monotonic()
         finish(process)
         length = time.monotonic() - training
-        moments = {
-            "training": (begun, lambda length=length: generator.uniform(0, 0.8 * length)),
+        moments: dict[str, tuple[Callable[[Path], bool], Callable[[], float]]] = {
+            "training": (begun, partial(generator.uniform, 0, 0.8 * length)),
             "writing a checkpoint": (writing_checkpoint, lambda: 0.0),
             "writing the results": (writing_results, lambda: 0.0),
         }
@@ -138,7 +140,11 @@ def kill_workflows(scratch: Path) -> list[bool]:
             encoding="utf-8",
         )
         command = [sys.executable, "-m", "snakemake", "-j2", "all", "--configfile", str(settings)]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
+        quiet: dict[str, Any] = {
+            "stdout": subprocess.DEVNULL,
+            "stderr": subprocess.DEVNULL,
+            "cwd": ROOT,
+        }
         if sent:
             process = subprocess.Popen(command, start_new_session=True, **quiet)
             while process.poll() is None and not list(results.glob(f"runs/*/*/*/{files.PROGRESS}")):

@@ -124,6 +124,7 @@ def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> No
         settings = study.run_config(environment, "mace_full", seed)
         probe = Probe(settings.model_copy(update={"beta": constant}))
         judge = beta_controller(settings, probe.environment, Streams(seed))
+        assert isinstance(judge, MetaAdaptation)
         runs.append(probe.measure(judge))
     print(f"{environment}, {seeds} seeds, β = {BETA}")
     updates = min(len(run["unscaled"]) for run in runs)

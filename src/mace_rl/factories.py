@@ -55,6 +55,7 @@ def beta_controller(
         case MetaBeta(initial=initial):
             size, actions = environment.observation_size, environment.action_space
             generator = streams["meta"]
+            assert config.meta is not None  # what a variant uses is there: `RunConfig`
             return MetaAdaptation(config.meta, initial, config.engine, size, actions, generator)
         case CustomBeta(rule=rule, arguments=arguments):
             return make(rule, "beta.rule", streams["beta"], **arguments)
@@ -70,6 +71,7 @@ def intrinsic_reward(
         case None:
             return None
         case CuriosityBonus():
+            assert config.novelty is not None  # as above
             return Curiosity(config.memory, config.novelty, config.engine, space, size, streams)
         case ICMBonus():
             return IntrinsicCuriosityModule(config.bonus, space, actions, size, generator)

@@ -9,7 +9,9 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy")
-def nearest(queries, points, mean, std, count):
+def nearest(
+    queries: np.ndarray, points: np.ndarray, mean: np.ndarray, std: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The `count` nearest points to each query, nearest first, in units of `std`.
 
     queries: float32 [N, size]; points: float32 [M, size], finite, M ≥ count; mean, std: float32

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import TypeGuard
 
 PACKAGE = Path(__file__).parent
 NAME = PACKAGE.name  # mace_rl
@@ -89,7 +90,7 @@ def _imported(file: Path) -> Iterator[Path]:
                 yield from _named(text)
 
 
-def _is_ours(module: str | None) -> bool:
+def _is_ours(module: str | None) -> TypeGuard[str]:
     return module is not None and module.partition(".")[0] == NAME
 
 

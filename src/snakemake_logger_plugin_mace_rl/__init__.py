@@ -37,7 +37,9 @@ class Study:
     `cores` is how many runs this machine carries out at once; None: others do, whatever they can.
     """
 
-    def __init__(self, runs: Iterable[Run], due: Iterable[tuple], cores: int | None) -> None:
+    def __init__(
+        self, runs: Iterable[Run], due: Iterable[tuple[str, str, str]], cores: int | None
+    ) -> None:
         self.runs = {run[:3]: run for run in runs}
         self.waiting = {key: self.runs[key] for key in due}
         self.begun: dict[Run, Pace] = {}  # or handed to a queue
@@ -45,7 +47,8 @@ class Study:
         self.cores = cores
         self.finished = {r: seconds for r in self.runs.values() if (seconds := r.seconds())}
         self.starts = [5.0]  # seconds of jobs beside the training; the first is a guess
-        self.countdown, self.without = Countdown(), None
+        self.countdown = Countdown()
+        self.without: list[str] | None = None
 
     def begins(self, run: Run) -> None:
         """Its job was started or handed to a queue."""
@@ -109,7 +112,7 @@ class LogHandler(LogHandlerBase):
     def __post_init__(self) -> None:
         self.display = Display(sys.stdout if self.common_settings.stdout else sys.stderr)
         self.study = Study([], [], None)
-        self.jobs: dict[int, LogRecord] = {}
+        self.jobs: dict[int, Any] = {}
         self.closed = threading.Event()
         self.refreshing = threading.Thread(target=self.refresh, daemon=True)
 
@@ -120,8 +123,11 @@ class LogHandler(LogHandlerBase):
         except Exception:  # noqa: BLE001  (like every handler: what is shown stops no work)
             self.handleError(record)
 
-    def follow(self, record: LogRecord) -> None:
-        """Keep account of the jobs and show what is of interest."""
+    def follow(self, record: Any) -> None:
+        """Keep account of the jobs and show what is of interest.
+
+        record: a `LogRecord` with what Snakemake adds to it, of a job its `info`.
+        """
         event = getattr(record, "event", None)
         if event == LogEvent.JOB_INFO:
             self.jobs[record.jobid] = record
@@ -146,12 +152,13 @@ class LogHandler(LogHandlerBase):
             gap = "\n" if event == LogEvent.JOB_INFO else ""
             self.display.print(gap + self.format(record), colour)
 
-    def run_of(self, job: LogRecord) -> Run | None:
+    def run_of(self, job: Any) -> Run | None:
         """The run of the study that a job trains; None if it does something else."""
         return self.study.runs.get(tuple(job.wildcards.values()))
 
     def refresh(self) -> None:
         """Keep the table up to date."""
+        assert self.lock is not None  # every handler has one
         while not self.closed.wait(1.0):
             with self.lock:
                 self.display.show(self.study.table(time.monotonic()))
@@ -166,7 +173,7 @@ class LogHandler(LogHandlerBase):
         super().close()
 
 
-def reason(job: LogRecord) -> str | None:
+def reason(job: Any) -> str | None:
     """Why a job failed, by its log, and where that is; None if it was interrupted."""
     log = Path(job.log[0])
     for line in reversed(log.read_text(errors="replace").splitlines() if log.exists() else []):

@@ -65,7 +65,14 @@ class Adam:
 
 
 @njit(cache=True, error_model="numpy")
-def adam(parameters, gradient, mean, square, time, learning_rate):
+def adam(
+    parameters: np.ndarray,
+    gradient: np.ndarray,
+    mean: np.ndarray,
+    square: np.ndarray,
+    time: int,
+    learning_rate: float,
+) -> None:
     """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; all arrays float32 [n].
 
     mean and square are the moments' running estimates, time counts steps from 1.

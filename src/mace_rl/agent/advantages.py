@@ -7,7 +7,9 @@ from numba import njit
 
 
 @njit(cache=True)
-def generalised_advantages(rewards, values, discount, gae_lambda):
+def generalised_advantages(
+    rewards: np.ndarray, values: np.ndarray, discount: float, gae_lambda: float
+) -> np.ndarray:
     """Generalised advantage estimation over one episode (Schulman et al. 2016, eq. 16).
 
     rewards: [T]; values: [T + 1], V(s_0) … V(s_T), where V(s_T) is 0 if s_T is terminal and the
@@ -53,7 +55,7 @@ def root_mean_square(values: np.ndarray) -> float:
 
 
 @njit(cache=True)
-def variance(values):
+def variance(values: np.ndarray) -> float:
     """Mean squared deviation from the mean of float64 [N]; several times faster than NumPy's."""
     mean = 0.0
     for value in values:

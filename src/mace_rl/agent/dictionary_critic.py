@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.ppo import Batch
 from mace_rl.config.run import DictionaryValue
@@ -26,7 +27,7 @@ class DictionaryCritic:
     or among the nearest. One experience thus counts at once, in full.
     """
 
-    optimiser = None
+    optimiser: Adam | None = None
 
     def __init__(
         self,
@@ -71,7 +72,7 @@ class DictionaryCritic:
         if len(self):
             squares, indices = self.search(unique, 1)
             places = np.where(squares[:, 0] <= SAME, indices[:, 0], -1)
-        found: dict[int, float] = {
+        found: dict[int | np.integer, float] = {
             group: float(self.returns[place]) for group, place in enumerate(places) if place >= 0
         }
         for group, target in zip(groups.ravel().tolist(), batch.returns[self.kind], strict=True):
@@ -108,7 +109,11 @@ class DictionaryCritic:
 
     def state_dict(self) -> dict[str, Any]:
         """See `Critic`."""
-        arrays = {"keys": self.keys, "returns": self.returns, "usage": self.usage}
+        arrays: dict[str, np.ndarray] = {
+            "keys": self.keys,
+            "returns": self.returns,
+            "usage": self.usage,
+        }
         stored = {name: array[: len(self)].copy() for name, array in arrays.items()}
         return {name: torch.from_numpy(array) for name, array in stored.items()} | {
             "time": self.time
@@ -124,6 +129,12 @@ class DictionaryCritic:
 
 class DictionaryModule(torch.nn.Module):
     """The same V(s) in torch, as it is now; reading it does not count as use."""
+
+    keys: Tensor
+    returns: Tensor
+    stored: Tensor
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, critic: DictionaryCritic) -> None:
         super().__init__()

@@ -154,26 +154,30 @@ def network(
 ) -> Network:
     """A network as the settings ask for it, newly initialised; `output_gain`: see `mlp`."""
     if isinstance(config.network, TorchModule):
-        return TorchNetwork(custom_module(config, inputs, outputs, generator))
-    module = mlp([inputs, *config.hidden_units, outputs], output_gain, generator)
-    return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
+        module = custom_module(config.network, config.hidden_units, inputs, outputs, generator)
+        return TorchNetwork(module)
+    layers = mlp([inputs, *config.hidden_units, outputs], output_gain, generator)
+    return CompiledMLP(layers) if engine == "compiled" else TorchNetwork(layers)
 
 
 def custom_module(
-    config: PPOConfig, inputs: int, outputs: int, generator: np.random.Generator
+    settings: TorchModule,
+    hidden_units: list[int],
+    inputs: int,
+    outputs: int,
+    generator: np.random.Generator,
 ) -> torch.nn.Module:
     """The user's own module; what it draws from torch's global generator comes from `generator`.
 
     Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
     are not [N, outputs] or not the same twice: such a run would not resume to the bit.
     """
-    settings = config.network
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(generator.integers(2**63)))
         module: torch.nn.Module = make(
             settings.module,
             "ppo.network.module",
-            *(inputs, outputs, config.hidden_units),
+            *(inputs, outputs, hidden_units),
             **settings.arguments,
         )
         trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
@@ -212,7 +216,8 @@ def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
     generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
     linear = [torch.nn.Linear(*pair) for pair in pairwise(sizes)]
     torch.set_rng_state(generator)
-    return torch.nn.Sequential(*(part for one in linear for part in (one, torch.nn.Tanh())))[:-1]
+    layers = [part for one in linear for part in (one, torch.nn.Tanh())]
+    return torch.nn.Sequential(*layers[:-1])
 
 
 def orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:

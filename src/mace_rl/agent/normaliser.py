@@ -56,7 +56,9 @@ class RunningNormaliser:
 
 
 @njit(cache=True, error_model="numpy")
-def updated(batch, count, mean, sum_of_squares):
+def updated(
+    batch: np.ndarray, count: int, mean: np.ndarray, sum_of_squares: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and sum of squared deviations, float64 [size], of `count` observations and a `batch`.
 
     batch: [N, size]. A compiled loop since an episode of 30 steps is less work than NumPy's calls.

@@ -72,7 +72,7 @@ class Policy:
     ) -> None:
         self.network = network
         self.discrete = isinstance(action_space, Discrete)
-        own = 0 if self.discrete else action_space.shape[0]
+        own = 0 if isinstance(action_space, Discrete) else action_space.shape[0]
         count = len(network.parameters)
         self.parameters = np.full(count + own, initial_log_std, np.float32)
         network.move_to(self.parameters[:count])

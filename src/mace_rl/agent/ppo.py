@@ -69,7 +69,9 @@ class Update:
 class Critic(Protocol):
     """V(s) for one kind of reward, and how it learns."""
 
-    optimiser: Adam | None  # None: there is nothing that gradients change
+    @property
+    def optimiser(self) -> Adam | None:
+        """None: there is nothing that gradients change."""
 
     def values(self, observations: np.ndarray) -> np.ndarray:
         """V of each state, float64 [N]; observations: normalised, float32 [N, observation]."""
@@ -115,6 +117,7 @@ class NetworkCritic:
             errors = trace.outputs - steps.returns[self.kind][:, None]
             gradient = self.network.backward(trace, 2 * errors)
             total = gradient if total is None else total + gradient
+        assert total is not None  # a batch has steps
         return total / np.float32(len(batch))
 
     def remember(self, batch: Batch) -> None:
@@ -162,7 +165,8 @@ class PPO:
         self.normaliser = normaliser
         self.minibatches = generator
         smallest = {"extrinsic": (1.0, config.smallest_advantage)}
-        self.reward_scales, self.advantage_scales = {}, {}
+        self.reward_scales: dict[str, RewardScale] = {}
+        self.advantage_scales: dict[str, AdvantageScale] = {}
         for kind in critics:
             least_reward, least_advantage = smallest.get(kind, (TINY, TINY))
             self.reward_scales[kind] = RewardScale(config.discount, least_reward)
@@ -253,6 +257,7 @@ class PPO:
             total = gradient if total is None else total + gradient
             divergence, outside = divergence + sums[0], outside + sums[1]
             entropy += uncertainty
+        assert total is not None  # a batch has steps
         count = len(batch)
         return -(total / np.float32(count)), divergence / count, outside / count, entropy / count
 
@@ -297,7 +302,8 @@ class PPO:
             critic.load_state_dict(state["critics"][kind])
         self.normaliser.load_state_dict(state["normaliser"])
         self.minibatches.bit_generator.state = state["minibatches"]
-        scales = self.reward_scales, self.advantage_scales
+        scales: list[Mapping[str, RewardScale | AdvantageScale]]
+        scales = [self.reward_scales, self.advantage_scales]
         for group, saved in zip(scales, state["scales"], strict=True):
             for kind, scale in group.items():
                 scale.load_state_dict(saved[kind])

@@ -68,7 +68,7 @@ class AdvantageScale:
 
 
 @njit(cache=True)
-def discounted_sums(rewards, discount):
+def discounted_sums(rewards: np.ndarray, discount: float) -> np.ndarray:
     """r_t + γ r_{t-1} + γ² r_{t-2} + … at each step of an episode, float64 [T]."""
     result = np.empty(len(rewards))
     total = 0.0

@@ -63,6 +63,8 @@ class States(NamedTuple):
 class CompiledMetaNetwork:
     """`MetaNetwork` in compiled code; `parameters` are the module's, one after the other."""
 
+    parameters: np.ndarray  # float32 [n]
+
     def __init__(self, module: MetaNetwork) -> None:
         self.shapes = {name: tuple(part.shape) for name, part in module.named_parameters()}
         vector = torch.nn.utils.parameters_to_vector(module.parameters())
@@ -122,20 +124,22 @@ def meta_network(
 
 
 @kernel
-def sigmoid(x):
+def sigmoid(x: np.float32) -> np.float32:
     """The logistic function of a float32 or float64."""
     return np.float32(0.5) + np.float32(0.5) * tanh(np.float32(0.5) * x)
 
 
 @kernel
-def quarters(vector):
+def quarters(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Four views of a vector, [4 H]."""
     size = len(vector) // 4
     return vector[:size], vector[size : 2 * size], vector[2 * size : 3 * size], vector[3 * size :]
 
 
 @kernel
-def lstm_states(sequence, weight_ih, weight_hh, bias):
+def lstm_states(
+    sequence: np.ndarray, weight_ih: np.ndarray, weight_hh: np.ndarray, bias: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Long short-term memory over a sequence, [T, in], from a zero state.
 
     weight_ih: [in, 4 H], weight_hh: [H, 4 H], bias: [4 H], for H units, whose columns are the
@@ -162,16 +166,16 @@ def lstm_states(sequence, weight_ih, weight_hh, bias):
 
 @kernel
 def lstm_gradients(
-    sequence,
-    gates,
-    cells,
-    hidden,
-    weight_hh,
-    grad_hidden,
-    grad_weight_ih,
-    grad_weight_hh,
-    grad_bias,
-):
+    sequence: np.ndarray,
+    gates: np.ndarray,
+    cells: np.ndarray,
+    hidden: np.ndarray,
+    weight_hh: np.ndarray,
+    grad_hidden: np.ndarray,
+    grad_weight_ih: np.ndarray,
+    grad_weight_hh: np.ndarray,
+    grad_bias: np.ndarray,
+) -> None:
     """Fill in the gradients with respect to weights and bias, by backpropagation in time.
 
     grad_hidden: the loss's gradient at the last hidden state, [H]; gates, cells and hidden as

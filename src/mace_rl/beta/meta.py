@@ -62,7 +62,9 @@ class MetaAdaptation(BetaController):
         self.initial = initial
         self.learns = config.learning_rate > 0
         self.action_count = int(action_space.n) if isinstance(action_space, Discrete) else 0
-        action_size = self.action_count or action_space.shape[0]
+        action_size = (
+            self.action_count if isinstance(action_space, Discrete) else action_space.shape[0]
+        )
         inputs = observation_size + action_size + 2 + Progress.SIZE
         self.network = meta_network(inputs, config.hidden_units, initial, engine, generator)
         self.optimiser = Adam(
@@ -121,14 +123,14 @@ class MetaAdaptation(BetaController):
         done = [judged for judged in self.judged if judged.updates == self.config.horizon]
         self.judged = self.judged[len(done) :]
         self.judged += [self.judge(self.sources.popleft(), effect) for effect in effects]
-        done = [judged for judged in done if judged.source is not None]
-        if not done:
+        sources = [judged.source for judged in done if judged.source is not None]
+        if not sources:
             return None
-        credits = [self.bounded(judged.credit) for judged in done]
+        credits = [self.bounded(judged.credit) for judged in done if judged.source is not None]
         # Adam descends, so what it gets is minus the mean.
         gradients = (
-            self.logit_gradient(judged.source, credit, -1 / len(done))
-            for judged, credit in zip(done, credits, strict=True)
+            self.logit_gradient(source, credit, -1 / len(sources))
+            for source, credit in zip(sources, credits, strict=True)
         )
         self.optimiser.step(reduce(np.add, gradients))
         return sum(credits) / len(credits)

@@ -17,7 +17,9 @@ from mace_rl.streams import Streams
 SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
 
 
-def relevance(similarity, recalled, worst, best):
+def relevance(
+    similarity: np.ndarray, recalled: np.ndarray, worst: float, best: float
+) -> np.ndarray:
     """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
 
     similarity: [N]; recalled: remembered return-to-go, [N]. Productivity is how far the recalled
@@ -50,7 +52,6 @@ class Curiosity(IntrinsicReward):
         observation_size: int,
         streams: Streams,
     ) -> None:
-        self.config = memory
         self.memory = None if memory is None else EpisodicMemory(memory, observation_size)
         # States are compared as this normaliser sees them; one-hot states as they are.
         self.normaliser = RunningNormaliser(observation_size)
@@ -92,19 +93,18 @@ class Curiosity(IntrinsicReward):
         returns: extrinsic return-to-go of each step, [T], as its λ-return.
         """
         if self.memory is not None:
-            self._memorise(episode, returns)
+            self._memorise(self.memory, episode, returns)
         if not self.discrete:
             self.normaliser.update(episode.observations[1:])
         self.novelty.observe(episode.observations[1:])
 
-    def _memorise(self, episode: Episode, returns: np.ndarray) -> None:
+    def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.
-        chosen = np.arange(
-            -self.steps % self.config.write_every, len(episode), self.config.write_every
-        )
+        every = memory.config.write_every
+        chosen = np.arange(-self.steps % every, len(episode), every)
         chosen = np.union1d(chosen, len(episode) - 1)
         self.steps += len(episode)
-        self.memory.write(
+        memory.write(
             torch.from_numpy(episode.observations[:-1][chosen]),
             torch.from_numpy(episode.observations[1:][chosen]),
             torch.from_numpy(episode.rewards[chosen]),

@@ -25,7 +25,8 @@ class MaskedAutoencoder(torch.nn.Module):
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
         super().__init__()
-        self.hidden, _, self.output = mlp([size, hidden_units, 2 * size], 0.1, generator)
+        layers = mlp([size, hidden_units, 2 * size], 0.1, generator)
+        self.hidden, self.output = (part for part in layers if isinstance(part, torch.nn.Linear))
         # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
         degrees = torch.arange(hidden_units) % max(size - 1, 1) + 1
         coordinates = torch.arange(1, size + 1)
@@ -89,7 +90,7 @@ class DensityEstimator:
 
 
 @njit(cache=True, error_model="numpy")
-def gaussian_log_probs(x, outputs, inverse_std):
+def gaussian_log_probs(x: np.ndarray, outputs: np.ndarray, inverse_std: np.ndarray) -> np.ndarray:
     """Σ_i log N(x_i; μ_i, σ_i) of each row, [N]; arguments as in `gaussian_grad`."""
     count, size = x.shape
     result = np.full(count, -0.5 * math.log(2 * math.pi) * size, x.dtype)
@@ -102,7 +103,7 @@ def gaussian_log_probs(x, outputs, inverse_std):
 
 
 @njit(cache=True, error_model="numpy")
-def gaussian_grad(x, outputs, inverse_std):
+def gaussian_grad(x: np.ndarray, outputs: np.ndarray, inverse_std: np.ndarray) -> np.ndarray:
     """Gradient of the mean over the rows of Σ_i log N(x_i; μ_i, σ_i) at the outputs, [N, 2 size].
 
     x: [N, size]; outputs: [N, 2 size], μ and log σ, which has no gradient below its lower bound;

@@ -29,7 +29,9 @@ class Dynamics(torch.nn.Module):
         super().__init__()
         hidden, features = config.hidden_units, config.feature_units
         self.discrete_actions = isinstance(action_space, Discrete)
-        actions = int(action_space.n) if self.discrete_actions else action_space.shape[0]
+        actions = (
+            int(action_space.n) if isinstance(action_space, Discrete) else action_space.shape[0]
+        )
         self.parts = [observation_size, observation_size, actions]
         self.features = mlp([observation_size, hidden, features], 1.0, generator)
         self.inverse_model = mlp([2 * features, hidden, actions], 1.0, generator)
@@ -61,6 +63,8 @@ class IntrinsicCuriosityModule(PredictionError):
     the features' gradient comes through both models.
     """
 
+    config: ICMBonus
+
     def __init__(
         self,
         config: ICMBonus,
@@ -72,7 +76,7 @@ class IntrinsicCuriosityModule(PredictionError):
         network = TorchNetwork(Dynamics(config, action_space, observation_size, generator))
         super().__init__(config, network, observation_space, observation_size, generator)
         self.action_space = action_space
-        self.weights = np.float32([1 - config.forward_weight, config.forward_weight])
+        self.weights = np.array([1 - config.forward_weight, config.forward_weight], np.float32)
 
     def inputs(self, episode: Episode) -> np.ndarray:
         """s and s', whitened, and the action as the environment took it, side by side."""

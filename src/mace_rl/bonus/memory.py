@@ -74,9 +74,9 @@ class EpisodicMemory:
             raise LookupError("the episodic memory is empty")
         newest_first = np.argsort(-self.number[:stored])
         points = (queries.detach(), self.keys[newest_first], mean, std)
-        squared_distances, places = nearest(
-            *(tensor.float().numpy() for tensor in points), min(self.config.neighbours, stored)
-        )
+        states, keys, centre, unit = (tensor.float().numpy() for tensor in points)
+        count = min(self.config.neighbours, stored)
+        squared_distances, places = nearest(states, keys, centre, unit, count)
         indices = newest_first[places]
         self.time += 1
         self.usage[indices] = self.time
@@ -90,8 +90,8 @@ class EpisodicMemory:
         # The same as autograd can follow it, for whoever trains through the memory; the method does
         # not. Which entries are nearest has no gradient.
         chosen = torch.from_numpy(indices)  # [N, k]
-        squared_distances = ((queries[:, None] - self.keys[chosen]) / std).square().mean(-1)
-        kernel = 1 / (squared_distances + bandwidth)
+        squares = ((queries[:, None] - self.keys[chosen]) / std).square().mean(-1)
+        kernel = 1 / (squares + bandwidth)
         weights = kernel / kernel.sum(1, keepdim=True)
         return Recollection(
             values=(weights[..., None] * self.values[chosen]).sum(1),
@@ -112,7 +112,9 @@ class EpisodicMemory:
 
 
 @njit(cache=True, error_model="numpy")
-def recollect(squared_distances, indices, values, bandwidth):
+def recollect(
+    squared_distances: np.ndarray, indices: np.ndarray, values: np.ndarray, bandwidth: float
+) -> tuple[np.ndarray, np.ndarray]:
     """What `lookup` computes from the nearest entries, without gradients.
 
     squared_distances: float32 [N, k], ascending; indices: int64 [N, k], rows of values, float32

@@ -61,7 +61,7 @@ def novelty(
             return CountNovelty(config, size)
         case "density" if isinstance(space, Box):
             return DensityNovelty(config, engine, normaliser, streams)
-        case "custom":
+        case "custom" if config.estimator is not None:
             given = size, streams["novelty"]
             return make(config.estimator, "novelty.estimator", *given, **config.arguments)
     raise ConfigError(

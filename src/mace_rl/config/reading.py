@@ -40,8 +40,10 @@ def merge(
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
-        both_mappings = isinstance(below, Mapping) and isinstance(value, Mapping)
-        merged[key] = merge(below, value) if both_mappings and key not in whole else value
+        if isinstance(below, Mapping) and isinstance(value, Mapping) and key not in whole:
+            merged[key] = merge(below, value)
+        else:
+            merged[key] = value
     return merged
 
 

@@ -89,7 +89,9 @@ class Environment:
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
         self.observation_size = (
-            int(observations.n) if self.discrete_observations else int(np.prod(observations.shape))
+            int(observations.n)
+            if isinstance(observations, Discrete)
+            else int(np.prod(observations.shape))
         )
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
@@ -99,7 +101,7 @@ class Environment:
 
     def encode(self, observation: Any) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]; may be the same memory."""
-        if self.discrete_observations:
+        if isinstance(self.observation_space, Discrete):
             vector = np.zeros(self.observation_size, np.float32)
             vector[int(observation) - int(self.observation_space.start)] = 1.0
             return vector
@@ -111,10 +113,10 @@ class Environment:
         return self.env.unwrapped.np_random
 
 
-def _is_image(space: gymnasium.Space) -> bool:
+def _is_image(space: gymnasium.Space[Any]) -> bool:
     return isinstance(space, Box) and len(space.shape) >= 2 and space.dtype == np.uint8
 
 
-def _kind(space: gymnasium.Space) -> str:
+def _kind(space: gymnasium.Space[Any]) -> str:
     """What a space that does not work is called."""
     return "image" if _is_image(space) else type(space).__name__.lower()

@@ -95,7 +95,15 @@ def towards_target(
 
 
 @njit(cache=True)
-def state_in_plane(raw, ranges, floor_xyz, target_x, target_y, initial_z, feet_contact):
+def state_in_plane(
+    raw: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    floor_xyz: NDArray[np.float64],
+    target_x: float,
+    target_y: float,
+    initial_z: float,
+    feet_contact: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], int, float, float, bool]:
     """`robot.calc_state` on the condition of `in_plane`, without which state[1:6] is wrong.
 
     raw: float64 [42], the ten parts' positions [10, 3], the joints' angles and speeds [3, 2], the
@@ -132,7 +140,7 @@ def state_in_plane(raw, ranges, floor_xyz, target_x, target_y, initial_z, feet_c
 
 
 @njit(cache=True)
-def effort(action, speeds):
+def effort(action: NDArray[np.floating], speeds: NDArray[np.float32]) -> tuple[float, float]:
     """Means of |action · speed| and action², in the precision of `action` [3] (as in numpy)."""
     (a1, a2, a3), three = action, action.dtype.type(3)
     power = (abs(a1 * speeds[0]) + abs(a2 * speeds[1]) + abs(a3 * speeds[2])) / three
@@ -152,6 +160,11 @@ class FastHopperBulletEnv(HopperBulletEnv):
     reward of an instance is off: its first reset averages the positions before the floor is one of
     the parts. After one throw-away reset, a fresh instance replays an aged one bit for bit.
     """
+
+    scene: Any  # the library's, from its first reset on
+    robot: Any  # the library's
+    reward: Any  # the library begins with an int and adds floats
+    _raw: Any  # float64 [42]; for mypy an ndarray is a buffer from Python 3.12 on
 
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode=render_mode)

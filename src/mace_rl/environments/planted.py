@@ -23,7 +23,7 @@ CONTEXTS = 4
 NOISE = 2.0  # standard deviation of the reward
 
 
-class Planted(gymnasium.Env[np.ndarray, int]):
+class Planted(gymnasium.Env[np.ndarray, np.int64]):
     """Observation: the context, one-hot, and the flag, float32 [CONTEXTS + 1]; two actions."""
 
     observation_space, action_space = Box(0, 1, (CONTEXTS + 1,), np.float32), Discrete(2)
@@ -45,7 +45,7 @@ class Planted(gymnasium.Env[np.ndarray, int]):
         observation[self.context], observation[-1] = 1, flag
         return observation
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int | np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Pay for the action in this context and show another one."""
         right = action == self.context % 2
         reward = float(right) + NOISE * self.np_random.standard_normal()

@@ -7,6 +7,7 @@ which gives the same episode to the bit. Callers cannot tell which one ran.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -46,7 +47,8 @@ def draw_noise(environment: Environment, generator: np.random.Generator) -> np.n
 
 def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
     """Play one episode by stepping the environment; see `Episode`."""
-    env, space = environment.env, environment.action_space
+    env = environment.env
+    space: Any = environment.action_space  # Discrete or Box
     discrete = isinstance(space, gymnasium.spaces.Discrete)
     observations = np.empty((len(noise) + 1, environment.observation_size), np.float32)
     actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
@@ -59,6 +61,7 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     terminated = truncated = False
     t = 0
     while not (terminated or truncated):
+        action: Any
         action, log_prob = policy.act(vector, noise[t])
         env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
         observation, reward, terminated, truncated, _ = env.step(env_action)
@@ -67,7 +70,7 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
         vector = observations[t]
         vector[:] = environment.encode(observation)
         if not (math.isfinite(reward) and math.isfinite(vector.sum())):
-            require_finite("the reward", reward, f" after step {t}")
+            require_finite("the reward", float(reward), f" after step {t}")
             require_finite("the observation", vector, f" after step {t}")
     # Copies: an episode that ended early should not hold the memory of a whole one.
     return Episode(
@@ -84,7 +87,7 @@ def roll_out_compiled(
 ) -> Episode:
     """Play one episode of CartPole-v1 or Acrobot-v1 in compiled code, equal to `roll_out`."""
     observation, _ = environment.env.reset()
-    inner = environment.env.unwrapped
+    inner: Any = environment.env.unwrapped
     cartpole = isinstance(inner, CartPoleEnv)
     which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
     return Episode(
@@ -96,7 +99,7 @@ def roll_out_compiled(
 
 def rollout_for(
     environment: Environment, policy: ActingPolicy
-) -> Callable[[Environment, ActingPolicy, np.ndarray], Episode]:
+) -> Callable[[Environment, Any, np.ndarray], Episode]:
     """The fastest rollout that is exact for this environment and this kind of policy.
 
     The compiled one has to take the same steps as the environment, which is tried here: other
@@ -109,10 +112,11 @@ def rollout_for(
     return roll_out_compiled if takes_compiled_steps(environment.env.unwrapped) else roll_out
 
 
-def takes_compiled_steps(inner: CartPoleEnv | AcrobotEnv) -> bool:
+def takes_compiled_steps(inner: Any) -> bool:
     """Whether a few hundred steps, anywhere in the state space, equal the compiled ones.
 
-    Every episode starts with a reset, so the states set here leave no trace.
+    inner: a CartPoleEnv or AcrobotEnv. Every episode starts with a reset, so the states set here
+    leave no trace.
     """
     states = np.random.default_rng(0)
     generator = inner.np_random.bit_generator.state

@@ -99,7 +99,8 @@ class MetresPassed(gymnasium.Wrapper):
 
     def _x(self) -> float:
         """Where the torso is on the way forward, in metres."""
-        return float(self.unwrapped.robot.body_real_xyz[0])
+        bare: Any = self.unwrapped
+        return float(bare.robot.body_real_xyz[0])
 
 
 class BarrenRegion(gymnasium.Env):

@@ -217,7 +217,7 @@ def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
     metrics = {metric.name: metric for metric in all_metrics(settings)}
     pairs = [_pair(part, table[table["env"] == env], metrics) for env in part.environments]
     everything = [_everything(part, table, env, metrics, settings) for env in part.environments]
-    unit = metrics[part.metric].unit if part.metric in metrics else "correlation"
+    unit: str = metrics[part.metric].unit if part.metric in metrics else "correlation"
     if len(pairs) > 1:
         pairs = [(x / all_, y / all_) for (x, y), all_ in zip(pairs, everything, strict=True)]
         everything, unit = [1.0], "share of everything"

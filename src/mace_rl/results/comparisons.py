@@ -96,11 +96,13 @@ def _compare(
         [(sign * x, sign * y) for x, y in restricted], *how, np.random.default_rng(seed)
     )
     censored = sum(int(np.isinf(values).sum()) for both in reached for values in both)
-    fewest = min(len(both[0]) for both in reached)
-    row = Comparison(ALL, metric.name, *pair, fewest, censored, *UNTESTED, np.nan, *better)
+    counts = min(len(both[0]) for both in reached), censored
+    variant, baseline = pair
+    row = Comparison(*(ALL, metric.name, variant, baseline, *counts, *UNTESTED, np.nan, *better))
     if len(runs) > 1:
         return row
-    compared = paired_comparison(*restricted[0], *how, np.random.default_rng(seed))
+    x, y = restricted[0]
+    compared = paired_comparison(x, y, *how, np.random.default_rng(seed))
     row = row._replace(env=str(runs[0]["env"].iloc[0]), test="sign-flip", **compared._asdict())
     if metric.unit == "episodes":
         p_value = logrank(*reached[0], how[1], np.random.default_rng(seed))
@@ -108,7 +110,7 @@ def _compare(
     return row
 
 
-def _reached(runs: pd.DataFrame, metric: Metric, pair: list[str]) -> list[np.ndarray]:
+def _reached(runs: pd.DataFrame, metric: Metric, pair: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """The metric's values of both variants, [seeds] each, in the order of the seeds.
 
     Of episodes, np.inf if never reached in the budget that both have.
@@ -118,7 +120,8 @@ def _reached(runs: pd.DataFrame, metric: Metric, pair: list[str]) -> list[np.nda
         in_budget = values <= runs["episodes"].min()
         values = values.where(in_budget & (runs[metric.flag] == 0), np.inf)
     wide = runs.assign(value=values).pivot(index="seed", columns="variant", values="value")
-    return [wide[variant].to_numpy() for variant in pair]
+    variant, baseline = pair
+    return wide[variant].to_numpy(), wide[baseline].to_numpy()
 
 
 def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
@@ -129,20 +132,20 @@ def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     of several noisy means is on average better than the best of the true ones: the regret errs
     upward, against the variant, and its interval with it.
     """
+    assert settings.regret is not None  # or nobody asks
     variant, constants = settings.regret.variant, settings.regret.constants
     areas, randoms, rows = [], [], []
     for environment, runs in table.groupby("env", sort=False):
         wide = runs.pivot(index="seed", columns="variant", values="area_under_curve")
         areas.append(wide[[variant, *constants]].to_numpy())  # [seeds, 1 + constants]
-        randoms.append(settings.random_return_in(environment))
+        randoms.append(settings.random_return_in(str(environment)))
         own, *others = areas[-1].mean(axis=0)
         best = constants[int(np.argmax(others))], max(others), own
-        rows.append(
-            Regret(environment, variant, *best, *_regret(areas[-1:], randoms[-1:], settings))
-        )
+        losses = _regret(areas[-1:], randoms[-1:], settings)
+        rows.append(Regret(*(str(environment), variant, *best, *losses)))
     if len(rows) > 1:
         nothing = "", np.nan, np.nan
-        rows.append(Regret(ALL, variant, *nothing, *_regret(areas, randoms, settings)))
+        rows.append(Regret(*(ALL, variant, *nothing, *_regret(areas, randoms, settings))))
     return pd.DataFrame(rows)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -210,11 +210,16 @@ def _draw(
     """One variant in one panel: every variant's single seeds are behind every band and line."""
     episodes, seeds = curve["episode"], curve["n"].max()
     if seeds > 1:
-        faint = {"color": colour, "linewidth": 0.5, "alpha": 0.6 / np.sqrt(seeds), "zorder": 1}
+        faint: dict[str, Any] = {
+            "color": colour,
+            "linewidth": 0.5,
+            "alpha": 0.6 / np.sqrt(seeds),
+            "zorder": 1,
+        }
         for _, run in runs.groupby("seed"):
             axes.plot(run["episode"], run[name], **faint)
     if seeds >= BAND_SEEDS:
-        band = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
+        band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
         axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
     axes.plot(episodes, curve["mean"], color=colour, linewidth=1.3, label=label, zorder=3)
 

@@ -311,6 +311,7 @@ def metrics_of_run(
     random = settings.random_return_in(environment)
     goals = [goal[environment] if goal else math.nan for goal in settings.goals]
     curve = LearningCurve(returns, final, random, settings, *goals)
+    row: dict[str, str | int | float]
     row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(returns)}
     row["env_steps"] = int(frame["env_steps"].iloc[-1])
     metrics = all_metrics(settings)

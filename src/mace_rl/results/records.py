@@ -5,10 +5,10 @@ the line, because a damaged record would otherwise become a plausible number in 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -63,8 +63,8 @@ def as_columns(kind: type[Row], rows: Sequence[Row]) -> dict[str, np.ndarray]:
     """The values of the rows by column, int64 or float64 [rows]."""
     types = {int: np.int64, float: np.float64}
     return {
-        field.name: np.array([getattr(row, field.name) for row in rows], types[field.type])
-        for field in fields(kind)
+        name: np.array([getattr(row, name) for row in rows], types[type_])
+        for name, type_ in get_type_hints(kind).items()
     }
 
 
@@ -108,8 +108,9 @@ def read_episodes(path: str | Path, episodes: int) -> "pd.DataFrame":
     Returns a frame with the columns of `EpisodeRecord` (int64 and float64) and one row per
     episode. Raises `RecordError` for a file that `write_episodes` did not write in full.
     """
-    frame = read_table(path, {field.name: field.type for field in fields(EpisodeRecord)})
-    _check_episodes(path, {name: frame[name].to_numpy() for name in frame})
+    columns = get_type_hints(EpisodeRecord)
+    frame = read_table(path, columns)
+    _check_episodes(path, {name: frame[name].to_numpy() for name in columns})
     if len(frame) != episodes:
         raise RecordError(
             f"{path}: line {len(frame) + 1} is the last, after {len(frame)} episodes;"

@@ -3,7 +3,7 @@
 The LaTeX is a fragment for \\input; it needs the package booktabs and nothing else.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -71,7 +71,8 @@ def summary(
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
-        published = PAPER_TABLE1.get((environment, variant), (None, None))
+        published = PAPER_TABLE1.get((str(environment), str(variant)), ())
+        paper = dict(zip(PAPER_METRICS, published, strict=False))  # empty if it has none
         for metric in metrics:
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
             low, high = mean_interval(  # a generator of its own: no cell depends on another
@@ -93,7 +94,7 @@ def summary(
                     "seeds": len(values),
                     "censored": int(runs[metric.flag].sum()) if metric.flag in runs else 0,
                     "episodes": int(runs["episodes"].iloc[0]),
-                    "paper": dict(zip(PAPER_METRICS, published, strict=True)).get(metric.name),
+                    "paper": paper.get(metric.name),
                 }
             )
     return pd.DataFrame(rows).astype({"paper": "Int64"})
@@ -169,7 +170,8 @@ def supplement_latex(
         return _stack(_mean(row, digits), rf"{{\scriptsize {_interval(row, digits)}}}")
 
     floats = []
-    for environment, own in table.groupby("env", sort=False):
+    for name, own in table.groupby("env", sort=False):
+        environment = str(name)
         blocks = [
             _tabular(
                 ["", *(_stack(*_label(variant, labels)) for variant in block)],
@@ -269,7 +271,8 @@ def _label(variant: str, labels: Mapping[str, str]) -> list[str]:
 
 def _cells(table: pd.DataFrame) -> dict[tuple[str, str, str], Any]:
     """The rows of a `summary` by environment, variant and metric."""
-    return {(row.env, row.variant, row.metric): row for row in table.itertuples()}
+    rows: Iterable[Any] = table.itertuples()
+    return {(row.env, row.variant, row.metric): row for row in rows}
 
 
 def _number(value: float, digits: int = 0) -> str:
@@ -296,7 +299,7 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     budgets: dict[str, list[str]] = {}
     for environment, group in table.groupby("env", sort=False):
         budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
-        budgets.setdefault(budget, []).append(environment)
+        budgets.setdefault(budget, []).append(str(environment))
     budget = "; ".join(
         f"{episodes} episodes ({latex(', '.join(environments))})"
         for episodes, environments in budgets.items()

@@ -24,6 +24,10 @@ from mace_rl.train import Trainer
 class PolicyModule(torch.nn.Module):
     """π(·|s) for observations as the environment gives them (Discrete ones: one-hot)."""
 
+    mean: Tensor
+    std: Tensor
+    clip: Tensor
+
     def __init__(self, ppo: PPO) -> None:
         super().__init__()
         self.network = ppo.policy.network.module()

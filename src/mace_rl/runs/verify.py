@@ -60,16 +60,17 @@ def repeat(run_folder: Path) -> Repetition:
         after = read_episodes(folder / files.EPISODES, config.episodes)
     different = (before != after).any(axis=1).to_numpy()
     kept = ("arithmetic", "versions", "sources")
-    origins = [{key: record[key] for key in kept} for record in (then, now)]
-    for origin, record in zip(origins, (then, now), strict=True):
-        origin["cpu"] = record["machine"]["cpu"]
+    old, new = (
+        {key: record[key] for key in kept} | {"cpu": record["machine"]["cpu"]}
+        for record in (then, now)
+    )
     return Repetition(
         name=f"{config.environment} {config.variant} seed {config.seed}",
         equal=then["outputs"] == now["outputs"],
         first=int(different.argmax()) + 1 if different.any() else None,
         returns=(before["extrinsic_return"].mean(), after["extrinsic_return"].mean()),
         spread=before["extrinsic_return"].std(),
-        origin=difference(*origins),
+        origin=difference(old, new),
     )
 
 
