@@ -1,6 +1,8 @@
 """The command `mace-rl`: mistakes are answered in one line before anything is done."""
 
+import argparse
 import json
+import shlex
 import shutil
 import sys
 
@@ -71,6 +73,7 @@ MALFORMED = {
     "unknown engine": ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
     "verify without folder": ["verify"],
     "evaluate without folder": ["evaluate", "--episodes", "3"],
+    "tensorboard without folder": ["tensorboard", "--out", "x"],
 }
 
 
@@ -134,6 +137,30 @@ def test_a_malformed_command_is_refused_with_its_reason(name, monkeypatch, capsy
     code, _ = call(monkeypatch, *MALFORMED[name])
     assert code == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("mace-rl")
+
+
+def subcommands() -> dict[str, argparse.ArgumentParser]:
+    """The parser of each subcommand."""
+    (action,) = [a for a in cli.parser()._actions if isinstance(a.choices, dict)]
+    return action.choices
+
+
+@pytest.mark.slow
+def test_the_examples_in_the_help_texts_work(monkeypatch, tmp_path, caplog, capsys):
+    """In the order of the help, each beginning where the one before ended."""
+    caplog.set_level("INFO")
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "reference/runs/CartPole-v1/mace_full/seed0"
+    kept.parent.mkdir(parents=True)
+    kept.symlink_to(tmp_path / "cartpole_run")  # what the first example makes
+    for name, parser in {"": cli.parser(), **subcommands()}.items():
+        word, program, *words = shlex.split(parser.epilog)
+        assert (word, program, words[0]) == ("example:", "mace-rl", name or "train")
+        assert call(monkeypatch, *words) == (0, ""), words
+    assert (tmp_path / "cartpole_run/episodes.csv").exists()
+    assert list((tmp_path / "events").iterdir())
+    assert "20 episodes: mean return" in (said := capsys.readouterr().out)
+    assert "1 of 1 runs equal to the bit" in said
 
 
 def leaves(section: dict, path: tuple = ()) -> list[tuple]:
@@ -244,6 +271,43 @@ def test_an_agent_plays_as_at_the_end_of_its_training(monkeypatch, tmp_path, cap
     (tmp_path / "agent.pt").write_bytes((tmp_path / "agent.pt").read_bytes()[:-7])
     code, message = call(monkeypatch, "evaluate", str(tmp_path))
     assert code == 1 and "agent.pt" in message and "cut off" in message
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+@pytest.mark.parametrize(
+    ("environment", "action"),
+    [
+        ("CartPole-v1", lambda policy: int(policy.probs.argmax())),
+        ("HopperBulletEnv-v0", lambda policy: policy.mean.numpy().clip(-1, 1)),
+    ],
+)
+def test_without_chance_an_agent_takes_its_most_probable_actions(
+    monkeypatch, tmp_path, environment, action, engine
+):
+    """As torch's distribution has them, in the library's own environment."""
+    import gymnasium
+    import torch
+
+    from mace_rl.runs.agent import load_agent
+    from mace_rl.runs.evaluate import evaluate
+
+    options = GOOD | {"--env": environment, "--engine": engine, "--out": str(tmp_path)}
+    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    policy, env = load_agent(tmp_path).policy, gymnasium.make(environment)
+    env.reset(seed=5)  # an environment's first reset is thrown away
+    env.reset(seed=5)
+    expected = []
+    for _ in range(3):
+        observation, _ = env.reset()
+        expected.append(0.0)
+        ends = [False]
+        while not any(ends):
+            with torch.no_grad():
+                chosen = action(policy(observation))
+            observation, reward, *ends, _ = env.step(chosen)
+            expected[-1] += reward
+    assert evaluate(tmp_path, 3, 5, deterministic=True) == pytest.approx(expected, rel=1e-3)
+    assert evaluate(tmp_path, 3, 5).tolist() != pytest.approx(expected, rel=1e-3)
 
 
 def test_a_kept_run_is_verified_to_the_bit(reference, monkeypatch, capsys):

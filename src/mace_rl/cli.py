@@ -1,4 +1,4 @@
-"""The command `mace-rl`: train one run, play with its agent, repeat runs that were kept."""
+"""The command `mace-rl`: train one run, play with its agent, look at runs, repeat kept ones."""
 
 import argparse
 import logging
@@ -18,13 +18,20 @@ CONFIG = Path(__file__).parents[2] / "config.yaml"
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mace-rl`."""
-    top = argparse.ArgumentParser(prog="mace-rl", description=__doc__, allow_abbrev=False)
+    top = argparse.ArgumentParser(
+        prog="mace-rl",
+        description=__doc__,
+        epilog="example: mace-rl train --help",
+        allow_abbrev=False,
+    )
     commands = top.add_subparsers(dest="command", required=True)
     train = commands.add_parser(
         "train",
         allow_abbrev=False,
         help="carry out one training run",
         description="Carry out one training run; the same command resumes it if interrupted.",
+        epilog="example: mace-rl train --env CartPole-v1 --variant mace_full --seed 0 "
+        "--episodes 100 --out cartpole_run",
     )
     train.add_argument("--env", required=True, help="a registered Gymnasium id")
     train.add_argument("--variant", required=True, help="one of the config's variant_settings")
@@ -44,15 +51,34 @@ def parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
         help="play episodes with a trained agent",
         description="Play episodes with a trained agent and print its returns.",
+        epilog="example: mace-rl evaluate cartpole_run --episodes 20 --deterministic",
     )
     evaluate.add_argument("folder", type=Path, help="of a finished run")
     evaluate.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     evaluate.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    evaluate.add_argument(
+        "--deterministic",
+        action="store_true",
+        help="take the most probable action, or the mean, instead of a sample",
+    )
+    tensorboard = commands.add_parser(
+        "tensorboard",
+        allow_abbrev=False,
+        help="write what runs recorded as TensorBoard's events",
+        description="Write what runs recorded, finished or not, as event files for TensorBoard; "
+        "again later, to bring them up to date.",
+        epilog="example: mace-rl tensorboard cartpole_run --out events",
+    )
+    tensorboard.add_argument("folder", type=Path, help="of a run, or with runs below it")
+    tensorboard.add_argument(
+        "--out", type=Path, help="folder for the event files (default: beside the records)"
+    )
     verify = commands.add_parser(
         "verify",
         allow_abbrev=False,
         help="repeat kept runs and compare to the bit",
         description="Repeat runs that were kept and say whether they come out the same.",
+        epilog="example: mace-rl verify reference --sample 1",
     )
     verify.add_argument("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
     verify.add_argument("--sample", type=int, help="how many, chosen at random (default: all)")
@@ -112,11 +138,22 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
     if arguments.episodes < 1 or arguments.seed < 0:
         raise ConfigError("--episodes should be at least 1 and --seed at least 0")
-    returns = evaluate.evaluate(arguments.folder, arguments.episodes, arguments.seed)
+    returns = evaluate.evaluate(
+        arguments.folder, arguments.episodes, arguments.seed, arguments.deterministic
+    )
     print(
         f"{len(returns)} episodes: mean return {returns.mean():.2f}, standard deviation "
         f"{returns.std():.2f}, from {returns.min():.2f} to {returns.max():.2f}"
     )
+
+
+def tensorboard(arguments: argparse.Namespace) -> None:
+    """`mace-rl tensorboard`."""
+    from mace_rl.runs import events
+
+    out = arguments.out or arguments.folder
+    count = events.write_all(arguments.folder, out)
+    logger.info("runs: %d; look at them with: tensorboard --logdir %s", count, out)
 
 
 def verify(arguments: argparse.Namespace) -> None:
@@ -135,9 +172,10 @@ def verify(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
     arguments = parser().parse_args()
+    commands = {"train": train, "evaluate": evaluate, "tensorboard": tensorboard, "verify": verify}
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
-        {"train": train, "evaluate": evaluate, "verify": verify}[arguments.command](arguments)
+        commands[arguments.command](arguments)
     except (ValueError, RuntimeError, ArithmeticError, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except KeyboardInterrupt:

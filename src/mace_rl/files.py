@@ -8,6 +8,7 @@ DIAGNOSTICS = "diagnostics.csv"  # one row per update
 AGENT = "agent.pt"  # the final weights
 RECORD = "run.json"  # configuration, versions, machine, digests; written last
 RESULTS = (EPISODES, DIAGNOSTICS, AGENT)  # what the same run has to give again, to the bit
+EVENTS = "events.out.tfevents.mace-rl"  # for TensorBoard, where they are asked for
 
 CHECKPOINT = "checkpoint.pt"  # while it runs: from which it resumes ...
 PROGRESS = "progress.json"  # ... and for whoever watches

@@ -4,14 +4,17 @@ policy = load_agent("results/runs/CartPole-v1/ppo/seed0").policy
 action = policy(observation).sample()
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from mace_rl import files
-from mace_rl.agent.policy import ActingPolicy
+from mace_rl.agent import kernels
+from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import PPO
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
@@ -63,6 +66,19 @@ class Agent(torch.nn.Module):
         )
 
 
+@dataclass(frozen=True)
+class MostProbable(NetworkActing):
+    """Acting without chance: the most probable action, the first of several; the mean of a Box."""
+
+    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
+        """See `ActingPolicy`; the noise does not matter."""
+        seen = kernels.normalise(observation, self.mean, self.inverse_std, self.clip)
+        with torch.no_grad():
+            outputs = self.policy.network.forward(seen[None]).outputs
+        action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]
+        return action, self.policy.log_probs(outputs, np.array([action]))[0]
+
+
 def load_agent(directory: str | Path) -> Agent:
     """The agent of the finished run in `directory`. Raises what `read_agent` raises."""
     config, state = read_agent(Path(directory))
@@ -71,10 +87,11 @@ def load_agent(directory: str | Path) -> Agent:
     return agent
 
 
-def load_acting(directory: Path) -> tuple[Environment, ActingPolicy]:
+def load_acting(directory: Path, deterministic: bool = False) -> tuple[Environment, ActingPolicy]:
     """The environment of the finished run in `directory`, and its policy for rollouts.
 
-    Raises what `read_agent` raises.
+    That samples its actions, or if `deterministic` takes the most probable ones. Raises what
+    `read_agent` raises.
     """
     config, state = read_agent(directory)
     trainer = Trainer(config)
@@ -85,7 +102,13 @@ def load_acting(directory: Path) -> tuple[Environment, ActingPolicy]:
     if not policy.discrete:
         policy.log_std[:] = state["policy.log_std"].numpy()
     mean, std = state["policy.mean"].numpy(), state["policy.std"].numpy()
-    return trainer.environment, policy.for_acting(mean, std, float(state["policy.clip"]))
+    clip = float(state["policy.clip"])
+    if deterministic:
+        unit = (1.0 / std).astype(np.float32)
+        return trainer.environment, MostProbable(
+            policy, mean.astype(np.float32), unit, np.float32(clip)
+        )
+    return trainer.environment, policy.for_acting(mean, std, clip)
 
 
 def read_agent(directory: Path) -> tuple[RunConfig, dict[str, Tensor]]:

@@ -49,14 +49,19 @@ def load(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     Raises `CheckpointError` if the file is cut off or altered, or if its identity is not
     `identity`; the message then names what differs.
     """
-    digest, _, data = path.read_bytes().partition(b"\n")
-    if hashlib.sha256(data).hexdigest().encode() != digest:
-        raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
-    content = unarchive(data, path)
+    content = read(path)
     found = content["identity"]
     if found != identity:
         raise CheckpointError(f"{path}: of another run: {difference(found, identity)}")
     return content["state"]
+
+
+def read(path: Path) -> dict[str, Any]:
+    """`identity` and `state` of a checkpoint, whosever; `CheckpointError` if it is damaged."""
+    digest, _, data = path.read_bytes().partition(b"\n")
+    if hashlib.sha256(data).hexdigest().encode() != digest:
+        raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
+    return unarchive(data, path)
 
 
 def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:

@@ -1,0 +1,105 @@
+"""What runs recorded as TensorBoard's events, for whoever compares runs there.
+
+They are made from a run's records whenever they are asked for, so that training neither depends on
+it nor changes by it. The package tensorboardX writes the files; only TensorBoard shows them.
+"""
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mace_rl import files
+from mace_rl.files import write_atomically
+from mace_rl.results.records import RecordError
+from mace_rl.runs import checkpoint
+from mace_rl.runs.provenance import file_digest, read_record
+
+# Of a run's tables: the prefix of their tags, and what they are called in a checkpoint.
+TABLES = {files.EPISODES: ("episodes", "records"), files.DIAGNOSTICS: ("updates", "diagnostics")}
+Table = Mapping[str, np.ndarray]  # columns, [rows]
+Row = tuple[int, dict[str, float]]  # the episode, and each tag's value
+
+
+class EventsError(RuntimeError):
+    """Events that cannot be written; the message says why."""
+
+
+def write_all(folder: Path, out: Path) -> int:
+    """Write the events of every run in and below `folder` to the same places below `out`.
+
+    Returns how many runs there are. Raises `RecordError` if there are none, or for damaged records,
+    and `EventsError` without tensorboardX.
+    """
+    names = (files.RECORD, files.CHECKPOINT)
+    runs = sorted({path.parent for name in names for path in folder.rglob(name)})
+    if not runs:
+        raise RecordError(f"{folder}: no run in it, finished or with a checkpoint")
+    for run in runs:
+        write(run, out / run.relative_to(folder))
+    return len(runs)
+
+
+def write(run: Path, out: Path) -> None:
+    """Write the events of one run to `out`, in place of earlier ones; equal records, equal bytes.
+
+    Records have no clock, so that every wall time is 0; steps are episodes.
+    """
+    try:
+        from tensorboardX import RecordWriter
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
+    except ImportError:
+        raise EventsError(
+            "events are written by the package tensorboardX: pip install tensorboardX"
+        ) from None
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch, files.EVENTS)
+        writer = RecordWriter(str(path))
+        writer.write(Event(file_version="brain.Event:2").SerializeToString())
+        for episode, values in rows(read(run)):
+            scalars = [Summary.Value(tag=tag, simple_value=x) for tag, x in values.items()]
+            event = Event(step=episode, summary=Summary(value=scalars))
+            writer.write(event.SerializeToString())
+        writer.close()
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomically(out / files.EVENTS, path.read_bytes())
+
+
+def read(run: Path) -> dict[str, Table]:
+    """The tables of a run by the prefix of their tags: its files, or what its checkpoint has.
+
+    A kept run may be without `diagnostics.csv`. Raises `RecordError` if a file is not the one that
+    `run.json` describes, `CheckpointError` and `ProvenanceError` for other damage.
+    """
+    import pandas as pd
+
+    if not (run / files.RECORD).exists():
+        state = checkpoint.read(run / files.CHECKPOINT)["state"]["trainer"]
+        return {
+            prefix: {name: column.numpy() for name, column in state[key].items()}
+            for prefix, key in TABLES.values()
+        }
+    digests = read_record(run / files.RECORD)["outputs"]
+    tables: dict[str, Table] = {}
+    for name, (prefix, _) in TABLES.items():
+        path = run / name
+        if path.exists() and file_digest(path) != digests[name]:
+            raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
+        if path.exists():
+            frame = pd.read_csv(path)
+            tables[prefix] = {str(column): frame[column].to_numpy() for column in frame}
+    return tables
+
+
+def rows(tables: Mapping[str, Table]) -> Iterator[Row]:
+    """The rows of the tables in the order of their episodes, without what is NaN."""
+    found: list[Row] = []
+    for prefix, table in tables.items():
+        names = [name for name in table if name not in ("episode", "update")]
+        values = zip(*(table[name].tolist() for name in names), strict=True)
+        for episode, row in zip(table["episode"].tolist(), values, strict=True):
+            cells = {f"{prefix}/{name}": x for name, x in zip(names, row, strict=True) if x == x}
+            found.append((episode, cells))
+    yield from sorted(found, key=lambda row: row[0])  # stable: episodes before their update
