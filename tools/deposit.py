@@ -1,0 +1,82 @@
+"""The committed tree as one file for a DOI repository, equal to the bit when made again.
+
+    .venv/bin/python -m tools.deposit [FOLDER]        make archive      (FOLDER: dist)
+
+FOLDER/mace-rl-VERSION.tar has what is committed (source, locks, reference runs), and SHA256SUMS of
+all that. Times, owners and order depend on the commit only. It is not compressed: compressors
+differ from version to version, and most of it is compressed already.
+"""
+
+import hashlib
+import io
+import subprocess
+import sys
+import tarfile
+import tomllib
+from pathlib import Path
+
+from mace_rl.files import write_atomically
+
+SUMS = "SHA256SUMS"
+
+
+class DepositError(RuntimeError):
+    """A tree that is not to be deposited; the message says why."""
+
+
+def git(repository: Path, *arguments: str) -> bytes:
+    """What git prints; `DepositError` with its reason if it fails."""
+    run = subprocess.run(["git", "-C", str(repository), *arguments], capture_output=True)
+    if run.returncode:
+        raise DepositError(" ".join(run.stderr.decode(errors="replace").split()))
+    return run.stdout
+
+
+def committed(repository: Path) -> dict[str, tuple[bytes, int]]:
+    """Content and mode of each file at HEAD; `DepositError` if the tree is not what is there."""
+    if changed := git(repository, "status", "--porcelain").decode().splitlines():
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        raise DepositError(f"not committed: {changed[0][3:]}{more}")
+    with tarfile.open(fileobj=io.BytesIO(git(repository, "archive", "HEAD"))) as tar:
+        members = ((member, tar.extractfile(member)) for member in tar.getmembers())
+        return {m.name: (file.read(), m.mode & 0o100) for m, file in members if file is not None}
+
+
+def deposit(repository: Path) -> tuple[str, bytes]:
+    """Name and content of the archive of HEAD; the same for the same commit, wherever it is."""
+    found = committed(repository)
+    project = tomllib.loads(found["pyproject.toml"][0].decode())["project"]
+    root = f"{project['name']}-{project['version']}"
+    sums = {name: hashlib.sha256(data).hexdigest() for name, (data, _) in found.items()}
+    lines = "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
+    found[SUMS] = lines.encode(), 0
+    commit, seconds = git(repository, "log", "-1", "--format=%H %ct").decode().split()
+    buffer = io.BytesIO()
+    named = {"comment": commit}  # where git itself puts it: `git get-tar-commit-id` reads it
+    with tarfile.open(
+        fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT, pax_headers=named
+    ) as tar:
+        for name, (data, executable) in sorted(found.items()):
+            member = tarfile.TarInfo(f"{root}/{name}")
+            member.size, member.mtime = len(data), int(seconds)
+            member.mode = 0o755 if executable else 0o644
+            tar.addfile(member, io.BytesIO(data))
+    return f"{root}.tar", buffer.getvalue()
+
+
+def main() -> None:
+    """Entry point."""
+    if len(sys.argv) > 2:
+        sys.exit(__doc__)
+    folder = Path(sys.argv[1] if len(sys.argv) == 2 else "dist")
+    try:
+        name, data = deposit(Path.cwd())
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / name, data)
+    except (DepositError, OSError) as error:
+        sys.exit(f"deposit: {error}")
+    print(f"{hashlib.sha256(data).hexdigest()}  {folder / name}")
+
+
+if __name__ == "__main__":
+    main()
