@@ -11,7 +11,11 @@ PARTS = ("speed", "breakdown", "growth", "workflow", "report")
 
 def main() -> None:
     """Carry out the parts that are asked for, each by the function `measure_all` of its module."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description=__doc__,
+        epilog="example: python -m benchmarks speed report --quick",
+    )
     parser.add_argument("parts", nargs="*", choices=[*PARTS, "all"], default="all")
     parser.add_argument(
         "--quick",

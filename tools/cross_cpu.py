@@ -244,7 +244,9 @@ def qemu() -> str:
 
 def main() -> None:
     """Run everything; exit with 1 unless every outcome is equal."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.cross_cpu --short"
+    )
     parser.add_argument("--short", action="store_true", help="one training under each processor")
     parser.add_argument(
         "--engine", choices=["compiled", "torch"], default="compiled", help="(default: compiled)"

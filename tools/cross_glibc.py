@@ -55,7 +55,10 @@ def train(start: list[str], environment: str, folder: Path) -> dict[str, bytes]:
 
 def main() -> None:
     """Entry point; exits with 1 if anything differs."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.cross_glibc libc6_unpacked",
+    )
     parser.add_argument("folder", nargs="+", type=Path, help="an unpacked libc6 package")
     folders = parser.parse_args().folder
     for folder in folders:

@@ -169,7 +169,9 @@ def kill_workflows(scratch: Path) -> list[bool]:
 
 def main() -> None:
     """Run everything; exit with 1 unless every outcome is equal."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.kill_test --repeats 3"
+    )
     parser.add_argument("--repeats", type=int, default=1, help="kills of each kind (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments (default: 0)")
     arguments = parser.parse_args()

@@ -56,7 +56,9 @@ def difference(name: str, outputs: list[str], check: bool) -> list[str]:
 
 def main() -> None:
     """Entry point; exits with 1 if anything differs from what is kept."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.tables --check"
+    )
     parser.add_argument("--check", action="store_true", help="keep nothing new")
     check = parser.parse_args().check
     os.chdir(ROOT)
