@@ -24,6 +24,8 @@ localrules:
     aggregate,
     curves,
     figure,
+    pictures,
+    readings,
 
 
 rule all:
@@ -42,6 +44,12 @@ rule all:
         f"{RESULTS}/figure2.pdf",
         f"{RESULTS}/figure2.png",
         f"{RESULTS}/figure2.csv",
+        *[f"{RESULTS}/{picture}.{kind}" for picture in PICTURES for kind in ("pdf", "png")],
+        f"{RESULTS}/profiles.csv",
+        f"{RESULTS}/readings.csv",
+        f"{RESULTS}/readings.md",
+        f"{RESULTS}/readings.pdf",
+        f"{RESULTS}/readings.png",
         *CLAIMS,
 
 

@@ -35,9 +35,12 @@ OUTPUTS = [
     *("metrics.csv", "comparisons.csv", "aggregate.csv", "table1.tex", "table1.csv", "table2.tex"),
     *("supplement.tex", "supplement.csv", "figure1.csv", "figure1_seeds.csv", "figure2.csv"),
     *("figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"),
+    *("every_seed.pdf", "every_seed.png", "profiles.csv", "profiles.pdf", "profiles.png"),
+    *("readings.csv", "readings.md", "readings.pdf", "readings.png"),
     *(f"{run}/{name}" for run in RUNS for name in ("episodes.csv", "diagnostics.csv", "agent.pt")),
 ]
-EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1, "curves": 2, "figure": 2}
+EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1}
+EVALUATION |= {"curves": 2, "figure": 2, "pictures": 1, "readings": 1}
 
 
 class Project:
@@ -193,13 +196,14 @@ CHANGES = {  # of a file, from one text to another, and what is to be done then
     "code of the LSTM": ("src/mace_rl/beta/lstm.py", "\n", "\n\n", TRAIN),
     "code of tables": ("src/mace_rl/results/tables.py", "\n", "\n\n", {"table1": 1, "table2": 1}),
     "code of figures": (
-        *("src/mace_rl/results/figures.py", "\n", "\n\n", {"curves": 2, "figure": 2}),
+        *("src/mace_rl/results/figures.py", "\n", "\n\n"),
+        {"curves": 2, "figure": 2, "pictures": 1, "readings": 1},
     ),
     "code of progress": ("src/mace_rl/runs/progress.py", "\n", "\n\n", {}),
     "a script": ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
     "a result": (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),
-        {"table1": 1, "comparisons": 1, "aggregate": 1},
+        {"table1": 1, "comparisons": 1, "aggregate": 1, "pictures": 1},
     ),
 }
 

@@ -23,7 +23,10 @@ ROOT = Path(__file__).resolve().parent.parent
 KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 # All but training: what is not kept of a run cannot be asked for.
-RULES = ("metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure", "claims")
+RULES = (
+    *("metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure", "claims"),
+    *("pictures", "readings"),
+)
 
 
 def make(name: str, study: dict[str, Any]) -> None:

@@ -42,3 +42,50 @@ rule figure:
         code=code("figure.py"),
     script:
         "../scripts/figure.py"
+
+
+rule pictures:
+    input:
+        f"{RESULTS}/metrics.csv",
+    output:
+        report(
+            [f"{RESULTS}/{picture}.png" for picture in PICTURES],
+            caption="../report/pictures.rst",
+            category="Supplement",
+        ),
+        [f"{RESULTS}/{picture}.pdf" for picture in PICTURES],
+        profiles=f"{RESULTS}/profiles.csv",
+    log:
+        f"{RESULTS}/logs/pictures.log",
+    params:
+        runs=BUDGETS,
+        settings=MEASURED.model_dump(),
+        labels=study.labels,
+        colours=study.colours,
+        code=code("pictures.py", MEASURED),
+    script:
+        "../scripts/pictures.py"
+
+
+rule readings:
+    input:
+        EPISODES,
+    output:
+        table=f"{RESULTS}/readings.csv",
+        markdown=report(
+            f"{RESULTS}/readings.md", caption="../report/readings.rst", category="Supplement"
+        ),
+        png=report(
+            f"{RESULTS}/readings.png", caption="../report/readings.rst", category="Supplement"
+        ),
+        pdf=f"{RESULTS}/readings.pdf",
+    log:
+        f"{RESULTS}/logs/readings.log",
+    params:
+        runs=BUDGETS,
+        settings=MEASURED.model_dump(),
+        labels=study.labels,
+        colours=study.colours,
+        code=code("readings.py", MEASURED),
+    script:
+        "../scripts/readings.py"

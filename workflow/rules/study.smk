@@ -42,6 +42,8 @@ TESTS_CLAIMS = (
     and set(paper.ENVIRONMENTS) <= set(study.metrics.reference_return)
 )
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
+# Pictures of every run at once; one of the regret only where the configuration asks for it.
+PICTURES = ["every_seed", "profiles", *(["regret"] if study.metrics.regret else [])]
 BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
 
 

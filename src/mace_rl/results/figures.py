@@ -133,7 +133,7 @@ def draw_figure(
     environments, variants = list(curves["env"].unique()), list(curves["variant"].unique())
     columns = min(layout.columns, max(len(environments), 1))
     rows = math.ceil(max(len(environments), 1) / columns)
-    with _style():
+    with style():
         height = rows * PANEL_HEIGHT + LEGEND_HEIGHT
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
@@ -185,11 +185,11 @@ def save_figure(figure: "Figure", path: str | Path) -> None:
     fields = (
         ("CreationDate", "Creator", "Producer") if Path(path).suffix == ".pdf" else ("Software",)
     )
-    with _style():
+    with style():
         figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dict.fromkeys(fields))
 
 
-def _style() -> AbstractContextManager[None]:
+def style() -> AbstractContextManager[None]:
     """The settings to draw and to save with: text is laid out on saving."""
     import matplotlib
     import seaborn

@@ -1,0 +1,262 @@
+"""What decides the ranking: Table 1 under every reading of its two metrics (docs/metrics.md).
+
+Beside the runs as they are stand the same runs with their returns in random order. Whoever is first
+there is first by chance and by how returns are distributed, since nothing is learnt in that order.
+"""
+
+import itertools
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.results.figures import LEGEND_HEIGHT, WIDTH, style
+from mace_rl.results.metrics import Metric, all_metrics, metrics_table
+from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
+from mace_rl.results.records import RunKey
+from mace_rl.results.statistics import logrank, mean_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"
+# The paper's words, and the rule of its public code: what is worth asking of noise too.
+ASKED_OF_NOISE = ("sample_efficiency", "convergence_steps_public_code")
+LEVEL = 0.05  # of the log-rank test that the first is really ahead
+
+
+def kinds(settings: MetricsConfig) -> list[tuple[str, Metric]]:
+    """Every reading with the one of the paper's metrics that it reads, in the order of tables."""
+    found = [metric for metric in all_metrics(settings) if metric.unit == "episodes"]
+    return [
+        (kind, metric) for kind in PAPER_METRICS for metric in found if metric.name.startswith(kind)
+    ]
+
+
+def shuffled(
+    frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig
+) -> dict[RunKey, pd.DataFrame]:
+    """The same runs, the returns of each in random order."""
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    return {
+        run: frame.assign(extrinsic_return=generator.permutation(frame["extrinsic_return"]))
+        for run, frame in frames.items()
+    }
+
+
+def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
+    """The data of readings.csv: one row per environment, reading, source and variant.
+
+    frames: the records (`read_episodes`) of each run (environment, variant, seed). Columns: env,
+    kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
+    variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
+    mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
+    """
+    wanted = list(frames)
+    sources = {RUNS: metrics_table(frames, wanted, settings)}
+    sources[SHUFFLED] = metrics_table(shuffled(frames, settings), wanted, settings)
+    rows = []
+    for environment in dict.fromkeys(name for name, _, _ in wanted):
+        variants = list(dict.fromkeys(v for e, v, _ in wanted if e == environment))
+        for place, kind in enumerate(PAPER_METRICS):
+            published = {
+                name: PAPER_TABLE1[environment, name][place]
+                for name in variants
+                if (environment, name) in PAPER_TABLE1
+            }
+            rows += _published(environment, kind, published)
+        for (kind, metric), source in itertools.product(kinds(settings), (RUNS, SHUFFLED)):
+            if source == RUNS or metric.name in ASKED_OF_NOISE:
+                table = sources[source]
+                own = table[table["env"] == environment]
+                rows += _measured(environment, kind, metric, source, own, settings)
+    return pd.DataFrame(rows)
+
+
+def _published(environment: str, kind: str, values: Mapping[str, int]) -> list[dict[str, object]]:
+    ranks = _ranks(values)
+    return [
+        {
+            "env": environment,
+            "kind": kind,
+            "reading": kind,
+            "source": PAPER,
+            "variant": name,
+            "mean": float(value),
+            "low": np.nan,
+            "high": np.nan,
+            "seeds": 0,
+            "censored": 0,
+            "rank": ranks[name],
+            "p_value": np.nan,
+        }
+        for name, value in values.items()
+    ]
+
+
+def _measured(
+    environment: str,
+    kind: str,
+    metric: Metric,
+    source: str,
+    runs: pd.DataFrame,
+    settings: MetricsConfig,
+) -> list[dict[str, object]]:
+    """The rows of one reading of one environment's runs."""
+    groups = {str(name): group for name, group in runs.groupby("variant", sort=False)}
+    ranks = _ranks({name: group[metric.name].mean() for name, group in groups.items()})
+    first = min(ranks, key=ranks.__getitem__)
+    reached = {
+        name: np.where(group[metric.flag] == 1, np.inf, group[metric.name])
+        for name, group in groups.items()
+    }
+    rows = []
+    for name, group in groups.items():
+        low, high = mean_interval(
+            group[metric.name].to_numpy(np.float64),
+            settings.confidence,
+            settings.bootstrap_repetitions,
+            np.random.default_rng(settings.bootstrap_seed),
+        )
+        p_value = np.nan
+        if name != first:
+            generator = np.random.default_rng(settings.bootstrap_seed)
+            p_value = logrank(
+                reached[first], reached[name], settings.bootstrap_repetitions, generator
+            )
+        rows.append(
+            {
+                "env": environment,
+                "kind": kind,
+                "reading": metric.name,
+                "source": source,
+                "variant": name,
+                "mean": group[metric.name].mean(),
+                "low": float(np.clip(low, 1, group["episodes"].iloc[0])),
+                "high": float(np.clip(high, 1, group["episodes"].iloc[0])),
+                "seeds": len(group),
+                "censored": int(group[metric.flag].sum()),
+                "rank": ranks[name],
+                "p_value": p_value,
+            }
+        )
+    return rows
+
+
+def _ranks(values: Mapping[str, float]) -> dict[str, int]:
+    """1 for the lowest; equal ones share the better rank."""
+    ordered = sorted(values.values())
+    return {name: 1 + ordered.index(value) for name, value in values.items()}
+
+
+def title(kind: str, reading: str, source: str, settings: MetricsConfig) -> str:
+    """A reading as a row of the table or the figure is called."""
+    names = {metric.name: metric.label for _, metric in kinds(settings)}
+    if source == PAPER:
+        return f"{names[kind]}: the paper's Table 1"
+    if source == SHUFFLED:
+        return f"{names[reading]}, returns shuffled"
+    return names[reading]
+
+
+def markdown(table: pd.DataFrame, settings: MetricsConfig) -> str:
+    """The small table: of each reading and environment the variants, the first one first.
+
+    table: that of `readings`. Bold is a first place that the log-rank test against each of the
+    others does not put down to chance (p < 0.05, not corrected for the many readings); † means that
+    some of the runs never got there.
+    """
+    environments = list(table["env"].unique())
+    lines = [
+        f"| episodes | {' | '.join(environments)} |",
+        "|---" * (1 + len(environments)) + "|",
+    ]
+    for (kind, reading, source), rows in _in_order(table):
+        cells = [_ranking(rows[rows["env"] == name]) for name in environments]
+        lines.append(f"| {title(kind, reading, source, settings)} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _in_order(
+    table: pd.DataFrame,
+) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
+    """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
+    found = [
+        ((str(kind), str(reading), str(source)), rows)
+        for (kind, reading, source), rows in table.groupby(
+            ["kind", "reading", "source"], sort=False
+        )
+    ]
+    sources = PAPER, RUNS, SHUFFLED
+    return sorted(found, key=lambda one: (PAPER_METRICS.index(one[0][0]), sources.index(one[0][2])))
+
+
+def _ranking(rows: pd.DataFrame) -> str:
+    """The variants in the order of their means."""
+    if rows.empty:
+        return ""
+    ordered = rows.sort_values("mean", kind="stable")
+    cells = [
+        f"{row.variant} {float(str(row.mean)):.0f}{'†' if row.censored else ''}"
+        for row in ordered.itertuples(index=False)
+    ]
+    others = ordered["p_value"].iloc[1:]
+    if others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1:
+        cells[0] = f"**{cells[0]}**"
+    return ", ".join(cells)
+
+
+def draw_readings(
+    table: pd.DataFrame,
+    labels: Mapping[str, str],
+    colours: Mapping[str, str],
+    settings: MetricsConfig,
+) -> "Figure":
+    """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
+    from matplotlib.figure import Figure
+
+    environments, lines = list(table["env"].unique()), _in_order(table)
+    variants = list(table["variant"].unique())
+    with style():
+        height = 0.34 * len(lines) + 2 * LEGEND_HEIGHT
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        panels = list(figure.subplots(1, len(environments), sharey=True, squeeze=False).flat)
+        for environment, axes in zip(environments, panels, strict=True):
+            for place, ((_, _, source), rows) in enumerate(lines):
+                own = rows[rows["env"] == environment].set_index("variant")
+                for name in own.index:
+                    row = own.loc[name]
+                    shift = 0.22 * (variants.index(name) - (len(variants) - 1) / 2)
+                    colour = colours[name]
+                    axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
+                    axes.plot(
+                        row["mean"],
+                        place + shift,
+                        "o",
+                        markersize=3.5,
+                        color=colour,
+                        markerfacecolor="white" if source == PAPER else colour,
+                        label=labels[name] if place == 1 else None,
+                    )
+            for place in range(len(lines) - 1):
+                axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
+            axes.set_xlim(left=0)
+            axes.locator_params(axis="x", nbins=4)
+            axes.set_title(environment)
+            axes.set_xlabel("Training episodes")
+        panels[0].set_yticks(
+            range(len(lines)), [title(*key, settings) for key, _ in lines], fontsize="small"
+        )
+        panels[0].invert_yaxis()
+        handles, names = panels[0].get_legend_handles_labels()
+        unique = dict(zip(names, handles, strict=True))
+        figure.legend(
+            unique.values(),
+            unique.keys(),
+            loc="outside lower center",
+            ncols=min(len(unique), 4),
+            title="Dot: mean over seeds, with its interval. Hollow: the paper.",
+        )
+    return figure

@@ -1,0 +1,23 @@
+"""What decides the ranking: every reading of Table 1's metrics, as data, table and picture."""
+
+from job import job
+
+with job("readings", snakemake.log[0]):
+    from mace_rl.config.results import MetricsConfig
+    from mace_rl.files import write_atomically
+    from mace_rl.results.figures import save_figure
+    from mace_rl.results.readings import draw_readings, markdown, readings
+    from mace_rl.results.records import read_episodes
+
+    params, output = snakemake.params, snakemake.output
+    settings = MetricsConfig.model_validate(params.settings)
+    frames = {
+        (env, variant, seed): read_episodes(path, episodes)
+        for path, (env, variant, seed, episodes) in zip(snakemake.input, params.runs, strict=True)
+    }
+    table = readings(frames, settings)
+    write_atomically(output.table, table.to_csv(index=False))
+    write_atomically(output.markdown, markdown(table, settings))
+    figure = draw_readings(table, params.labels, params.colours, settings)
+    for path in (output.png, output.pdf):
+        save_figure(figure, path)
