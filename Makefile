@@ -21,7 +21,7 @@ SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick tables bench verify cross-cpu kill-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick tables numbers bench verify cross-cpu kill-test archive lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -37,6 +37,9 @@ test-quick: setup ## the tests that take seconds, for the edit loop
 
 tables: setup ## every table, figure and verdict from the runs in reference/, without training
 	@$(IN_VENV) tools.tables
+
+numbers: setup ## write what the tables of reference/ say into README and docs
+	@$(IN_VENV) tools.numbers
 
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)

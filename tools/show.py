@@ -1,0 +1,254 @@
+"""Print what the kept results say, as the Markdown that README and docs have between marks.
+
+    .venv/bin/python -m tools.show WHAT FOLDER [...]
+
+FOLDER is one of reference/tables, or the results of any study. WHAT is one of
+
+    headline    what holds, in two sentences                                       (claims.json)
+    ledger      a verdict for each claim                                           (claims.json)
+    parts       what the verdicts rest on, part by part; `parts FOLDER robust`     (claims.json)
+    table1      Table 1, the paper's numbers beside ours                            (table1.csv)
+    means       final return and mean return of training; `means FOLDER COLUMN ...` (metrics.csv)
+    solved      how many seeds solve each task                                     (metrics.csv)
+    constants   mean return of training by variant, in columns                     (metrics.csv)
+    regret      what the learnt β loses against the best constant                   (regret.csv)
+    improvement probability that one variant's run is better than another's    (comparisons.csv)
+    aggregate   scores between random and the best run, all environments          (aggregate.csv)
+    readings    Table 1 under every reading                                         (readings.md)
+"""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.results.claims import LITERAL, ROBUST
+from mace_rl.results.statistics import mean_interval
+
+SOLVED = 0.9  # of the last episodes, for a seed to count
+AREA = "area_under_curve"
+
+
+def headline(folder: Path) -> list[str]:
+    """How many claims came out how, and what the learnt β changes in final returns."""
+    found = _claims(folder)
+    counts = Counter(claim[ROBUST]["verdict"] for claim in found["claims"])
+    literal = Counter(claim[LITERAL]["verdict"] for claim in found["claims"])
+    verdicts = ("reproduced", "contradicted", "inconclusive")
+    total = len(found["claims"])
+    robust = ", ".join(f"{counts[verdict]} {verdict}" for verdict in verdicts)
+    words = ", ".join(f"{literal[verdict]} {verdict}" for verdict in verdicts)
+    parts = [
+        part
+        for claim in found["claims"]
+        if claim["claim"] in ("C7", "C8")
+        for part in claim[ROBUST]["parts"]
+        if part["baseline"] == "ppo"
+    ]
+    overall = next(part for part in parts if len(part["environments"]) > 1)
+    return [
+        f"**Of the paper's {total} claims: {robust}** by robust metrics ({words} as the paper's own"
+        " code measures). Over its three environments the mean return of training with the learned"
+        f" β differs from PPO's by {_percent(overall['difference'])} of the way from random to"
+        f" solved (95 % interval {_percent(overall['low'])} to {_percent(overall['high'])},"
+        f" at least {overall['seeds']} seeds in each)."
+    ]
+
+
+def ledger(folder: Path) -> list[str]:
+    """The verdicts."""
+    lines = [
+        f"| | the paper's claim | {LITERAL} | {ROBUST} | the paper's own Table 1 |",
+        "|---|---|---|---|---|",
+    ]
+    for claim in _claims(folder)["claims"]:
+        verdicts = " | ".join(claim[how]["verdict"] for how in (LITERAL, ROBUST))
+        lines.append(f"| {claim['claim']} | {claim['statement']} | {verdicts} | {claim['paper']} |")
+    return lines
+
+
+def parts(folder: Path, how: str = ROBUST) -> list[str]:
+    """Every part of every claim."""
+    lines = [
+        "| | environment | metric | over | n | difference | p (Holm) | detectable | |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for claim in _claims(folder)["claims"]:
+        for part in claim[how]["parts"]:
+            digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+            low, mean, high, detectable = (
+                _number(part[name], digits) for name in ("low", "difference", "high", "detectable")
+            )
+            cells = [
+                claim["claim"],
+                ", ".join(part["environments"]) if len(part["environments"]) == 1 else "all",
+                part["metric"],
+                f"{part['variant']} over {part['baseline'] or 0}",
+                str(part["seeds"]),
+                f"{mean} ({low} to {high})",
+                f"{part['p_holm']:.3f}",
+                detectable,
+                part["outcome"],
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def table1(folder: Path) -> list[str]:
+    """Sample efficiency / convergence by variant and environment: ours, and the paper's."""
+    table = pd.read_csv(folder / "table1.csv")
+    environments = list(table["env"].unique())
+    lines = [f"| | {' | '.join(environments)} |", "|---" * (1 + len(environments)) + "|"]
+    for variant in table["variant"].unique():
+        cells = []
+        for environment in environments:
+            rows = table[(table["env"] == environment) & (table["variant"] == variant)]
+            means = " / ".join(
+                f"{row['mean']:.0f}" + (f"†{row['censored']}" if row["censored"] else "")
+                for _, row in rows.iterrows()
+            )
+            ends = " / ".join(
+                f"{row['low']:.0f} to {row['high']:.0f}" for _, row in rows.iterrows()
+            )
+            paper = " / ".join(f"{value:.0f}" for value in rows["paper"])
+            cells.append(f"{means} ({ends}); paper: {paper}")
+        lines.append(f"| {variant} | {' | '.join(cells)} |")
+    return lines
+
+
+def means(folder: Path, *columns: str) -> list[str]:
+    """Means over seeds with their intervals."""
+    table = pd.read_csv(folder / "metrics.csv")
+    wanted = list(columns) or ["final_return", AREA]
+    lines = [f"| | | seeds | {' | '.join(wanted)} |", "|---" * (3 + len(wanted)) + "|"]
+    for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
+        cells = " | ".join(_mean(runs[column]) for column in wanted)
+        lines.append(f"| {environment} | {variant} | {len(runs)} | {cells} |")
+    return lines
+
+
+def solved(folder: Path) -> list[str]:
+    """Seeds that solve a task, of how many, and the mean return of training."""
+    return _columns(
+        folder,
+        lambda runs: (
+            f"{int((runs['solved'] >= SOLVED).sum())} of {len(runs)}; {_short(runs[AREA].mean())}"
+        ),
+    )
+
+
+def constants(folder: Path) -> list[str]:
+    """The mean return of training by variant."""
+    return _columns(folder, lambda runs: _mean(runs[AREA]))
+
+
+def regret(folder: Path) -> list[str]:
+    """regret.csv."""
+    lines = ["| | best constant | its return | learned β | regret | seeds |", "|---" * 6 + "|"]
+    for _, row in pd.read_csv(folder / "regret.csv", keep_default_na=False).iterrows():
+        cells = [row["env"], row["best_constant"], *map(_short, row[["best_area", "variant_area"]])]
+        regret, low, high = (_number(float(row[name]), 4) for name in ("regret", "low", "high"))
+        lines.append(f"| {' | '.join(cells)} | {regret} ({low} to {high}) | {row['seeds']} |")
+    return lines
+
+
+def improvement(folder: Path, metric: str = AREA) -> list[str]:
+    """P(a run of one is better) in each environment and over all, from comparisons.csv."""
+    table = pd.read_csv(folder / "comparisons.csv")
+    table = table[table["metric"] == metric]
+    environments = list(table["env"].unique())
+    lines = [f"| | {' | '.join(environments)} |", "|---" * (1 + len(environments)) + "|"]
+    for (variant, baseline), rows in table.groupby(["variant", "baseline"], sort=False):
+        values = rows.set_index("env")
+        cells = [
+            f"{values.loc[name, 'probability']:.2f} ({values.loc[name, 'probability_low']:.2f} to"
+            f" {values.loc[name, 'probability_high']:.2f})"
+            for name in environments
+        ]
+        lines.append(f"| {variant} over {baseline} | {' | '.join(cells)} |")
+    return lines
+
+
+def aggregate(folder: Path) -> list[str]:
+    """aggregate.csv."""
+    lines = ["| | | runs | mean | interquartile mean |", "|---" * 5 + "|"]
+    for _, row in pd.read_csv(folder / "aggregate.csv").iterrows():
+        cells = [
+            f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
+            for name in ("mean", "iqm")
+        ]
+        lines.append(
+            f"| {row['metric']} | {row['variant']} | {row['runs']} | {' | '.join(cells)} |"
+        )
+    return lines
+
+
+def readings(folder: Path) -> list[str]:
+    """readings.md as it is."""
+    return (folder / "readings.md").read_text(encoding="utf-8").splitlines()
+
+
+def _claims(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "claims.json").read_text(encoding="utf-8")))
+
+
+def _columns(folder: Path, cell: Callable[[pd.DataFrame], str]) -> list[str]:
+    """A table of metrics.csv with a line per variant and a column per environment."""
+    table = pd.read_csv(folder / "metrics.csv")
+    environments = list(table["env"].unique())
+    lines = [f"| | {' | '.join(environments)} |", "|---" * (1 + len(environments)) + "|"]
+    for variant in table["variant"].unique():
+        own = table[table["variant"] == variant]
+        groups = [own[own["env"] == name] for name in environments]
+        cells = [cell(runs) if len(runs) else "" for runs in groups]
+        lines.append(f"| {variant} | {' | '.join(cells)} |")
+    return lines
+
+
+def _mean(values: pd.Series) -> str:
+    """A mean over seeds with the interval of the tables."""
+    numbers = values.to_numpy(np.float64)
+    low, high = mean_interval(numbers, 0.95, 10_000, np.random.default_rng(0))
+    return f"{_short(numbers.mean())} ({_short(float(low))} to {_short(float(high))})"
+
+
+def _short(value: float | str) -> str:
+    """Four significant digits, with a true minus; an empty cell stays empty."""
+    return f"{float(value):.4g}".replace("-", "−") if value != "" else ""
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "−")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %".replace("-", "−")
+
+
+SHOWN: dict[str, Callable[..., list[str]]] = {
+    function.__name__: function
+    for function in (
+        *(headline, ledger, parts, table1, means, solved, constants, regret, improvement),
+        *(aggregate, readings),
+    )
+}
+
+
+def main() -> None:
+    """Entry point; exits with what is wrong with the arguments."""
+    if len(sys.argv) < 3 or sys.argv[1] not in SHOWN:
+        sys.exit(__doc__)
+    try:
+        lines = SHOWN[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])
+    except OSError as error:
+        sys.exit(f"show: {error.filename}: {error.strerror}")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
