@@ -3,7 +3,6 @@
 from job import job
 
 with job("claims", snakemake.log[0]):
-    import json
     from pathlib import Path
 
     from mace_rl.config.results import MetricsConfig
@@ -33,7 +32,6 @@ with job("claims", snakemake.log[0]):
     ledger = claims.ledger(table, settings)
     seconds = sum(read_record(Path(path))["seconds"] for path in snakemake.input.records)
     cost = {"command": params.command, "runs": len(table), "core_hours": seconds / 3600}
-    text = json.dumps({"cost": cost, "claims": ledger}, indent=2, ensure_ascii=False)
-    write_atomically(snakemake.output.json, text + "\n")
+    write_atomically(snakemake.output.json, claims.as_json(ledger, cost))
     origin = f"`{cost['command']}`: {cost['runs']} runs, {cost['core_hours']:.1f} core-hours."
     write_atomically(snakemake.output.markdown, claims.markdown(ledger, origin))

@@ -4,6 +4,7 @@ A claim is made of parts, each a comparison of two variants; a part holds, fails
 claim is reproduced, contradicted or inconclusive. Everything here was fixed before the study ran.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -290,6 +291,11 @@ def _paper(claim: Claim) -> str:
     names = {PPO: "PPO", FIXED: "fixed", FULL: "full"}
     numbers = ", ".join(f"{names[name]} {value}" for name, value in values.items())
     return f"{PAPER_METRICS[column]}: {numbers}; the best is {names[first]}"
+
+
+def as_json(records: Sequence[Mapping[str, Any]], cost: Mapping[str, Any]) -> str:
+    """The data of claims.json: what it cost, then the records of `ledger`."""
+    return json.dumps({"cost": cost, "claims": records}, indent=2, ensure_ascii=False) + "\n"
 
 
 def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:

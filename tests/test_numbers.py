@@ -1,0 +1,88 @@
+"""README and docs say what the kept tables say, and what is printed of them is right."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mace_rl.config.study import Study
+from mace_rl.results import claims
+from tests.test_claims import table
+from tools import numbers, show
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_pages_say_what_the_kept_tables_say(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["numbers", "--check"])
+    numbers.main()
+    printed = capsys.readouterr().out
+    assert printed.endswith("marked texts, 0 differ\n")
+    assert int(printed.split()[0]) >= 5
+
+
+def test_a_number_that_is_not_printed_is_refused_and_mended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "docs").mkdir()
+    shutil.copytree(ROOT / "reference/tables/baseline", tmp_path / "reference/tables/baseline")
+    page = tmp_path / "README.md"
+    page.write_text(
+        "<!-- python -m tools.show means reference/tables/baseline -->\n9\n<!-- end -->"
+    )
+    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    monkeypatch.setattr("sys.argv", ["numbers", "--check"])
+    with pytest.raises(SystemExit, match=r"README\.md: means reference/tables/baseline"):
+        numbers.main()
+    assert "\n9\n" in page.read_text()
+    monkeypatch.setattr("sys.argv", ["numbers"])
+    numbers.main()
+    assert "| Acrobot-v1 | ppo | 20 |" in page.read_text()
+    page.write_text("<!-- python -m tools.show means reference/none -->\n<!-- end -->")
+    with pytest.raises(SystemExit, match="reference/none"):
+        numbers.main()
+
+
+def test_the_study_page_has_no_number_of_its_own() -> None:
+    text = numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
+    own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
+    assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
+
+
+def write(frame: pd.DataFrame, folder: Path) -> Path:
+    frame.to_csv(folder / "metrics.csv", index=False)
+    return folder
+
+
+def test_means_and_solved_seeds(tmp_path: Path) -> None:
+    rows = [
+        {"env": env, "variant": "ppo", "seed": seed, "final_return": seed + 0.5}
+        | {"area_under_curve": -float(seed), "solved": 0.9 if seed < 3 else 0.89}
+        for env in ("A-v0", "B-v0")
+        for seed in range(4)
+    ]
+    folder = write(pd.DataFrame(rows), tmp_path)
+    mean = show.means(folder, "final_return")[2]
+    assert mean.startswith("| A-v0 | ppo | 4 | 2 (")
+    low, high = map(float, re.findall(r"\((\S+) to (\S+)\)", mean.replace("−", "-"))[0])
+    half = 3.182446 * np.std([0.5, 1.5, 2.5, 3.5], ddof=1) / 2  # t with 3 degrees of freedom
+    assert (low, high) == (pytest.approx(2 - half, abs=1e-3), pytest.approx(2 + half, abs=1e-3))
+    assert show.solved(folder)[2] == "| ppo | 3 of 4; −1.5 | 3 of 4; −1.5 |"
+
+
+def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
+    frame = table(20, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    text = claims.as_json(claims.ledger(frame, settings), {"runs": 1})
+    (tmp_path / "claims.json").write_text(text, encoding="utf-8")
+    (line,) = show.headline(tmp_path)
+    assert "10 claims: 9 reproduced, 1 contradicted, 0 inconclusive" in line
+    share = float(re.findall(r"by (\S+) % of the way", line)[0])
+    assert share == pytest.approx(30, abs=3)
+    assert len(show.ledger(tmp_path)) == 12
+    assert sum("| holds |" in line for line in show.parts(tmp_path)) == 22
