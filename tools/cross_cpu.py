@@ -6,7 +6,8 @@ Libraries ask the processor what it can do, and who made it, and choose their co
 qemu-user the emulated processor answers. Every environment and variant is trained for some episodes
 on this processor, and again under each emulated one, which compiles everything for itself.
 Trainings are also begun here and ended there, and the other way round. What is there in the end has
-to equal the undisturbed training here byte for byte.
+to equal the undisturbed training here byte for byte. So have Table 1 and Figure 1 made there of the
+kept runs in reference/, which hold those of this processor or another.
 
 An emulator does what the instructions are defined to do. So this finds whatever depends on which
 instructions are chosen, but not what real processors make of the same ones.
@@ -51,8 +52,14 @@ SHORT = {  # --short: every environment and every variant, each under one proces
 }
 
 
+TABLES = Path("reference")  # in the place of an environment: what is made of the runs there
+TABLE_FILES = tuple(f"table1.{kind}" for kind in ("csv", "tex")) + tuple(
+    f"figure1{kind}" for kind in (".csv", "_seeds.csv", ".png", ".pdf")
+)
+
+
 class Training(NamedTuple):
-    """One training."""
+    """One training, or the tables and figures of the kept runs."""
 
     processor: str
     environment: str
@@ -61,6 +68,8 @@ class Training(NamedTuple):
 
     def __str__(self) -> str:
         halved = f", {self.half} here" if self.half else ""
+        if self.environment == str(TABLES):
+            return f"{self.processor} Table 1 and Figure 1"
         return f"{self.processor} {self.environment} {self.variant}{halved}"
 
 
@@ -83,6 +92,8 @@ def planned(short: bool) -> list[Training]:
         for variant, environment in cells:
             halves = ("", "begun", "ended") if variant == HALVED else ("",)
             trainings += [Training(processor, environment, variant, half) for half in halves]
+        if not short:
+            trainings.append(Training(processor, str(TABLES), ""))
     return trainings
 
 
@@ -102,6 +113,10 @@ def train() -> None:
     engine, *tasks = json.loads(sys.argv[1])
     study = read_study([CONFIG])
     for number, (environment, variant, folder, halt) in enumerate(tasks):
+        if environment == str(TABLES):
+            tabulate(Path(folder))
+            print(f"\nfinished {number}", flush=True)
+            continue
         settings = study.run_config(environment, variant, 0).settings()
         changes: dict[str, Any]
         changes = {section: values for section, values in CHANGES.items() if section in settings}
@@ -112,6 +127,47 @@ def train() -> None:
         else:
             run.run(config, Path(folder))
         print(f"\nfinished {number}", flush=True)
+
+
+def tabulate(folder: Path) -> None:
+    """Make `TABLE_FILES` of the kept runs as the workflow's rules do."""
+    import pandas as pd
+
+    from mace_rl.cli import CONFIG
+    from mace_rl.config.study import read_study
+    from mace_rl.results import figures, tables
+    from mace_rl.results.metrics import metrics_table
+    from mace_rl.results.records import read_episodes
+
+    study = read_study([CONFIG, CONFIG.parent / "config" / "reference.yaml"])
+    settings, frames = study.metrics, {}
+    for run in study.runs():
+        environment, variant, seed = run
+        path = TABLES / "runs" / environment / variant / f"seed{seed}" / files.EPISODES
+        frames[run] = read_episodes(path, study.run_config(*run).episodes)
+    table = tables.table1(metrics_table(frames, list(frames), settings), settings)
+    folder.mkdir(parents=True)
+    (folder / "table1.csv").write_text(table.to_csv(index=False), encoding="utf-8")
+    latex = tables.table1_latex(table, study.labels, settings)
+    (folder / "table1.tex").write_text(latex, encoding="utf-8")
+    shown = figures.quantity("1", settings)
+    seeds = figures.seed_curves(frames, shown)
+    curves = figures.mean_curves(seeds, shown, settings)
+    data = {"figure1.csv": curves, "figure1_seeds.csv": seeds}
+    for name, frame in data.items():
+        (folder / name).write_text(frame.to_csv(index=False), encoding="utf-8")
+    drawn, drawn_seeds = (pd.read_csv(folder / name) for name in data)
+    figure = figures.draw_figure(
+        drawn,
+        drawn_seeds,
+        shown,
+        study.figure,
+        settings.confidence,
+        study.labels,
+        study.colours,
+    )
+    for name in ("figure1.pdf", "figure1.png"):  # as the rule does: each saving lays out anew
+        figures.save_figure(figure, folder / name)
 
 
 def begin(run: Any, config: Any, folder: Path) -> None:
@@ -191,8 +247,12 @@ def emulate(
 
 def judge(training: Training, scratch: Path) -> bool:
     """Whether a training ended as the undisturbed one here did; prints a line that says so."""
-    undisturbed = training._replace(processor=HERE, half="")
-    found = difference(scratch / str(undisturbed), scratch / str(training), bool(training.half))
+    if training.environment == str(TABLES):
+        pairs = ((ROOT / TABLES / name, scratch / str(training) / name) for name in TABLE_FILES)
+        found = ", ".join(a.name for a, b in pairs if a.read_bytes() != b.read_bytes())
+    else:
+        undisturbed = training._replace(processor=HERE, half="")
+        found = difference(scratch / str(undisturbed), scratch / str(training), bool(training.half))
     print(f"{training}: {f'DIFFERENT: {found}' if found else 'equal'}", flush=True)
     return not found
 
@@ -254,7 +314,9 @@ def main() -> None:
     arguments = parser.parse_args()
     emulator, engine = qemu(), arguments.engine
     trainings = planned(arguments.short)
-    undisturbed = dict.fromkeys(t._replace(processor=HERE, half="") for t in trainings)
+    undisturbed = dict.fromkeys(
+        t._replace(processor=HERE, half="") for t in trainings if t.environment != str(TABLES)
+    )
     first = [(t, False) for t in undisturbed] + [(t, True) for t in trainings if t.half == "begun"]
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
@@ -272,15 +334,17 @@ def main() -> None:
             ]
         except CrossError as error:
             sys.exit(f"cross-cpu: {error}")
-    whole, halved = (
-        f"{sum(bool(t.half) == half for t in equal)} of "
-        f"{sum(bool(t.half) == half for t in trainings)}"
-        for half in (False, True)
+    kinds = {
+        "trainings": lambda t: t.environment != str(TABLES) and not t.half,
+        "continued on another processor": lambda t: bool(t.half),
+        "Table 1 and Figure 1": lambda t: t.environment == str(TABLES),
+    }
+    counts = (
+        f"{sum(map(kind, equal))} of {sum(map(kind, trainings))} {name}"
+        for name, kind in kinds.items()
+        if any(map(kind, trainings))
     )
-    print(
-        f"{whole} trainings, and {halved} continued on another processor, equal to the bit under "
-        f"{len(PROCESSORS)} emulated processors"
-    )
+    print(f"{', '.join(counts)}: equal to the bit under {len(PROCESSORS)} emulated processors")
     sys.exit(len(equal) != len(trainings))
 
 
