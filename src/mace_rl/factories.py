@@ -1,5 +1,6 @@
 """The parts of a run, made as its settings ask for: what sets β, the bonus, PPO."""
 
+import numpy as np
 from gymnasium.spaces import Discrete
 
 from mace_rl.agent.dictionary_critic import DictionaryCritic
@@ -19,6 +20,7 @@ from mace_rl.bonus.rnd import RandomNetworkDistillation
 from mace_rl.config.plugins import make
 from mace_rl.config.run import (
     BanditBeta,
+    BetaRule,
     ConstantBeta,
     CuriosityBonus,
     CustomBeta,
@@ -44,21 +46,30 @@ def beta_controller(
     match config.beta:
         case NoBonus():
             return None
-        case ConstantBeta():
-            return Constant(config.beta)
-        case RandomBeta():
-            return RandomDraw(config.beta, streams["beta"])
-        case BanditBeta():
-            return SlidingWindowBandit(config.beta, config.ppo.rollout_steps, streams["beta"])
-        case ExponentialBeta():
-            return ExponentialSchedule(config.beta)
         case MetaBeta(initial=initial):
             size, actions = environment.observation_size, environment.action_space
             generator = streams["meta"]
             assert config.meta is not None  # what a variant uses is there: `RunConfig`
             return MetaAdaptation(config.meta, initial, config.engine, size, actions, generator)
+        case rule:
+            return beta_rule(rule, config.ppo.rollout_steps, streams["beta"])
+
+
+def beta_rule(
+    settings: BetaRule, rollout_steps: int, generator: np.random.Generator
+) -> BetaController:
+    """What sets β without a network of ours; `rollout_steps`: between updates of the policy."""
+    match settings:
+        case ConstantBeta():
+            return Constant(settings)
+        case RandomBeta():
+            return RandomDraw(settings, generator)
+        case BanditBeta():
+            return SlidingWindowBandit(settings, rollout_steps, generator)
+        case ExponentialBeta():
+            return ExponentialSchedule(settings)
         case CustomBeta(rule=rule, arguments=arguments):
-            return make(rule, "beta.rule", streams["beta"], **arguments)
+            return make(rule, "beta.rule", generator, **arguments)
 
 
 def intrinsic_reward(

@@ -20,16 +20,30 @@ def nearest(
     [N, count], and the points' indices, int64 [N, count]; of equally distant points the first in
     `points` come first.
     """
-    total, size = points.shape
+    return nearest_in_columns(queries, in_columns(points, mean, std), mean, std, count)
+
+
+@njit(cache=True, error_model="numpy")
+def in_columns(points, mean, std):
+    """`points` as `nearest_in_columns` takes them, for searches among the same ones, float32."""
     # Points on columns, so that inner loops run along contiguous memory; dimensions four at a time,
     # to load and store the sums less often, filled up with zeros.
-    padded = (size + 3) // 4 * 4
-    columns = np.zeros((padded, total), np.float32)
-    rows = np.zeros((len(queries), padded), np.float32)
+    total, size = points.shape
+    columns = np.zeros(((size + 3) // 4 * 4, total), np.float32)
     for i in range(size):
         scale = np.float32(1) / std[i]
         for m in range(total):
             columns[i, m] = (points[m, i] - mean[i]) * scale
+    return columns
+
+
+@njit(cache=True, error_model="numpy")
+def nearest_in_columns(queries, columns, mean, std, count):
+    """`nearest` of the points that `in_columns` was given, with the same `mean` and `std`."""
+    padded, total = columns.shape
+    rows = np.zeros((len(queries), padded), np.float32)
+    for i in range(len(mean)):
+        scale = np.float32(1) / std[i]
         for n in range(len(queries)):
             rows[n, i] = (queries[n, i] - mean[i]) * scale
     squared_distances = np.empty((len(queries), count), np.float32)

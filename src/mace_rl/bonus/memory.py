@@ -78,8 +78,7 @@ class EpisodicMemory:
         count = min(self.config.neighbours, stored)
         squared_distances, places = nearest(states, keys, centre, unit, count)
         indices = newest_first[places]
-        self.time += 1
-        self.usage[indices] = self.time
+        self.mark_used(indices)
         bandwidth = self.config.kernel_bandwidth
         if not (queries.requires_grad or self.values.requires_grad):
             size = queries.shape[1]
@@ -97,6 +96,11 @@ class EpisodicMemory:
             values=(weights[..., None] * self.values[chosen]).sum(1),
             similarity=bandwidth * kernel[:, 0],  # the nearest comes first
         )
+
+    def mark_used(self, entries: np.ndarray) -> None:
+        """Count `entries`, int64 of any shape, as read now, all at the same time."""
+        self.time += 1
+        self.usage[entries] = self.time
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""

@@ -302,9 +302,8 @@ class CustomBeta(Section):
     arguments: dict[str, Any] = Field(default={})
 
 
-BetaConfig = (
-    NoBonus | ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | MetaBeta | CustomBeta
-)
+BetaRule = ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | CustomBeta
+BetaConfig = NoBonus | MetaBeta | BetaRule
 
 
 class RunConfig(Section):

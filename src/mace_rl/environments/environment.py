@@ -1,4 +1,4 @@
-"""Making environments: Gymnasium's registry, observations as vectors, generators that resume."""
+"""Making environments: Gymnasium's registry, generators that resume."""
 
 import copy
 import os
@@ -10,10 +10,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
-from gymnasium.spaces import Box, Discrete
 
 from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError
+from mace_rl.environments.spaces import Spaces
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
@@ -36,10 +36,9 @@ def nothing_printed() -> Iterator[None]:
             os.close(copy_)
 
 
-class Environment:
+class Environment(Spaces):
     """A Gymnasium environment with its observation size, time limit and random generator.
 
-    Observations are flat float32 vectors; a Discrete observation becomes a one-hot vector.
     `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id,
     arguments it does not take, a missing time limit and unsupported spaces.
     """
@@ -74,49 +73,14 @@ class Environment:
                     raise
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
                 raise ConfigError(f"environment {name!r} with {arguments}: {reason}") from None
-        observations, actions = self.env.observation_space, self.env.action_space
-        if not isinstance(observations, Box | Discrete) or _is_image(observations):
-            raise ConfigError(
-                f"environment {name!r} has {_kind(observations)} observations, {observations}; "
-                "Box (vectors) and Discrete ones work"
-            )
-        if not (
-            isinstance(actions, Discrete) or (isinstance(actions, Box) and actions.shape[1:] == ())
-        ):
-            raise ConfigError(
-                f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box work"
-            )
-        self.observation_space, self.action_space = observations, actions
-        self.discrete_observations = isinstance(observations, Discrete)
-        self.observation_size = (
-            int(observations.n)
-            if isinstance(observations, Discrete)
-            else int(np.prod(observations.shape))
-        )
+        super().__init__(name, self.env.observation_space, self.env.action_space)
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
         # environment with the same generator state replay an aged one to the bit.
         with nothing_printed():
             self.env.reset(seed=int(seed.generate_state(1)[0]))
 
-    def encode(self, observation: Any) -> np.ndarray:
-        """`observation` as a float32 vector, [observation_size]; may be the same memory."""
-        if isinstance(self.observation_space, Discrete):
-            vector = np.zeros(self.observation_size, np.float32)
-            vector[int(observation) - int(self.observation_space.start)] = 1.0
-            return vector
-        return np.asarray(observation, np.float32).ravel()
-
     @property
     def generator(self) -> np.random.Generator:
         """The environment's own generator."""
         return self.env.unwrapped.np_random
-
-
-def _is_image(space: gymnasium.Space[Any]) -> bool:
-    return isinstance(space, Box) and len(space.shape) >= 2 and space.dtype == np.uint8
-
-
-def _kind(space: gymnasium.Space[Any]) -> str:
-    """What a space that does not work is called."""
-    return "image" if _is_image(space) else type(space).__name__.lower()
