@@ -1,0 +1,614 @@
+"""Curiosity for other agents: what is paid, by the trainer's own bonus; checkers; resuming."""
+
+import copy
+import io
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+import yaml
+from gymnasium.spaces import Box, Discrete
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import mace_rl.environments  # noqa: F401  (registers ours)
+from mace_rl import wrappers
+from mace_rl.beta.controller import BetaController
+from mace_rl.beta.controls import RandomDraw
+from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.bonus.novelty import Novelty
+from mace_rl.config.run import MemoryConfig, NoveltyConfig, RandomBeta
+from mace_rl.config.section import ConfigError
+from mace_rl.config.wrappers import MEMORY, NOVELTY
+from mace_rl.environments.rollout import Episode
+from mace_rl.finite import NonFiniteError
+from mace_rl.runs.checkpoint import archive
+from mace_rl.streams import Streams
+from mace_rl.wrappers import CuriosityReward, VectorCuriosityReward
+
+ROOT = Path(__file__).parents[1]
+# Limits small enough that the buffer and the memory get full within a test, and replace what they
+# hold.
+SMALL = {
+    "memory": {"capacity": 60, "write_every": 3},
+    "novelty": {"buffer_size": 120, "write_every": 2, "neighbours": [3, 8, 5]},
+}
+RANDOM = {"kind": "random", "low": 0.2, "high": 0.7}
+BANDIT = {"kind": "bandit", "arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
+ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "DeepSea10-v0"]
+
+
+def step(env, number: int):
+    """A step with an action that depends on its number alone."""
+    space = env.action_space
+    rng = np.random.default_rng(number)
+    if isinstance(space, Discrete):
+        return env.step(int(rng.integers(space.n)))
+    return env.step(rng.uniform(space.low, space.high).astype(np.float32))
+
+
+def play(env, steps: int, seed: int = 0) -> list[tuple]:
+    """What so many steps returned, episode after episode."""
+    env.reset(seed=seed)
+    found = []
+    for number in range(steps):
+        found.append(copy.deepcopy(step(env, number)))
+        if found[-1][2] or found[-1][3]:
+            env.reset()
+    return found
+
+
+def vector_of(name: str, count: int, mode: AutoresetMode) -> SyncVectorEnv:
+    makers = [lambda: gymnasium.make(name) for _ in range(count)]
+    return SyncVectorEnv(makers, autoreset_mode=mode)
+
+
+def play_vector(env, steps: int, seed: int = 0) -> list[tuple]:
+    """The same of several environments, with the same actions in each as `play` would take."""
+    env.reset(seed=seed)
+    found = []
+    for number in range(steps):
+        action = np.random.default_rng(number).integers(env.single_action_space.n)
+        found.append(copy.deepcopy(env.step(np.full(env.num_envs, action))))
+    return found
+
+
+# --- What is paid -------------------------------------------------------------------------------
+
+
+class ByEpisodes:
+    """What should be paid, computed when an episode is over, as the trainer appraises it."""
+
+    def __init__(self, space, size: int, beta: BetaController | float, seed: int) -> None:
+        self.beta = beta
+        memory = MemoryConfig(**MEMORY | SMALL["memory"])
+        novelty = NoveltyConfig(**NOVELTY | SMALL["novelty"])
+        self.curiosity = Curiosity(memory, novelty, "torch", space, size, Streams(seed))
+        self.sums = [[], []]  # discounted, of extrinsic rewards and of bonuses
+
+    def pay(self, episode: Episode) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """β, the unit, and the bonus with its factors; then the episode is remembered."""
+        bonus = self.curiosity.bonus(episode)
+        beta = self.beta if isinstance(self.beta, float) else self.beta.beta
+        unit = 0.0
+        if self.sums[0]:
+            extrinsic, intrinsic = (np.std(sums) for sums in self.sums)
+            unit = max(extrinsic, 1.0) / intrinsic
+        for sums, rewards in zip(self.sums, (episode.rewards, bonus.reward), strict=True):
+            for t in range(len(episode)):
+                sums.append(sum(0.99 ** (t - k) * rewards[k] for k in range(t + 1)))
+        ahead = range(len(episode))
+        returns = [sum(0.99 ** (k - t) * episode.rewards[k] for k in ahead[t:]) for t in ahead]
+        self.curiosity.remember(episode, np.array(returns))
+        if not isinstance(self.beta, float):
+            self.beta.next_episode(episode, bonus.reward)
+        return beta, unit, bonus
+
+
+@pytest.mark.parametrize("beta", [0.3, RANDOM])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_pays_what_the_trainer_s_curiosity_gives_for_whole_episodes(name, beta):
+    """From observations and rewards of an environment without a wrapper, episode by episode."""
+    bare, steps = gymnasium.make(name), 700
+    env = CuriosityReward(gymnasium.make(name), beta, seed=5, **SMALL)
+    paid = play(env, steps)
+    discrete = isinstance(bare.observation_space, Discrete)
+    size = int(bare.observation_space.n) if discrete else bare.observation_space.shape[0]
+    rule = beta if beta == 0.3 else RandomDraw(RandomBeta(**RANDOM), Streams(5)["beta"])
+    expected = ByEpisodes(bare.observation_space, size, rule, seed=5)
+
+    def vector(state):
+        return np.eye(size, dtype=np.float32)[state] if discrete else np.float32(state)
+
+    observation, _ = bare.reset(seed=0)
+    states, rewards, episodes = [vector(observation)], [], 0
+    for number in range(steps):
+        observation, reward, terminated, truncated, _ = step(bare, number)
+        states.append(vector(observation))
+        rewards.append(float(reward))
+        if not (terminated or truncated):
+            continue
+        length = len(rewards)
+        unknown = np.zeros(length, np.float32)
+        episode = Episode(np.array(states), unknown, unknown, np.array(rewards), terminated)
+        beta_now, unit, bonus = expected.pay(episode)
+        for t, (_, total, *_, info) in enumerate(paid[number + 1 - length : number + 1]):
+            assert info["reward_extrinsic"] == rewards[t] and info["beta"] == beta_now
+            found = [info[part] for part in ("curiosity", "novelty", "relevance")]
+            by_episode = [bonus.reward[t], bonus.novelty[t], bonus.relevance[t]]
+            np.testing.assert_allclose(found, by_episode, rtol=1e-4, atol=1e-5)
+            added = beta_now * unit * info["curiosity"]
+            assert info["reward_curiosity"] == pytest.approx(added, rel=1e-4, abs=1e-12)
+            assert total == info["reward_extrinsic"] + info["reward_curiosity"]
+        observation, _ = bare.reset()
+        states, rewards, episodes = [vector(observation)], [], episodes + 1
+    assert episodes >= 3
+    kept, memory = expected.curiosity.memory, env.appraisal.curiosity.curiosity.memory
+    assert (kept.usage == memory.usage).all() and (kept.number == memory.number).all()
+    assert (kept.keys == memory.keys).all()
+
+
+def test_nothing_is_paid_before_the_first_end():
+    found = play(CuriosityReward(gymnasium.make("FrozenLake-v1")), 200)
+    end = next(number for number, item in enumerate(found) if item[2] or item[3])
+    first, later = ([item[4] for item in part] for part in (found[: end + 1], found[end + 1 :]))
+    assert all(info["curiosity"] > 0 == info["reward_curiosity"] for info in first)
+    assert any(info["reward_curiosity"] > 0 for info in later)
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "DeepSea10-v0"])
+def test_without_relevance_the_bonus_is_the_novelty(name):
+    env = CuriosityReward(gymnasium.make(name), relevance=False)
+    for *_, info in play(env, 300):
+        assert info["curiosity"] == info["novelty"] and info["relevance"] == 1
+    assert env.appraisal.curiosity.curiosity.memory is None
+
+
+def test_beta_0_leaves_every_reward_as_it_is():
+    bare, env = gymnasium.make("Pendulum-v1"), gymnasium.make("Pendulum-v1")
+    for one, other in zip(play(bare, 500), play(CuriosityReward(env, 0), 500), strict=True):
+        assert one[1] == other[1] and (one[0] == other[0]).all()
+
+
+def test_what_the_environment_tells_stays_in_info():
+    found = play(CuriosityReward(gymnasium.make("FrozenLake-v1")), 20)
+    assert all({*wrappers.PARTS, "prob"} == set(info) for *_, info in found)
+
+
+@pytest.mark.parametrize("unit", [5.0, 1000.0])
+def test_the_bonus_keeps_its_strength_when_the_unit_of_reward_changes(unit):
+    """Above the floor of 1; relevance, by the return's place from worst to best, stays too."""
+
+    def scaled(factor):
+        return gymnasium.wrappers.TransformReward(
+            gymnasium.make("Pendulum-v1"), lambda reward: factor * reward
+        )
+
+    one, other = (play(CuriosityReward(scaled(factor)), 1000) for factor in (1.0, unit))
+    for (*_, small), (*_, large) in zip(one[200:], other[200:], strict=True):
+        assert large["reward_curiosity"] == pytest.approx(unit * small["reward_curiosity"], 1e-3)
+
+
+def test_an_episode_that_is_reset_early_is_not_learnt_from():
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), seed=3)
+    play(env, 300)
+    before = archive(env.state_dict())
+    after = []
+    for _ in range(2):
+        env.reset(seed=1)
+        after.append([step(env, number)[1] for number in range(3)])
+    assert after[0] == after[1]
+    env.reset(seed=1)
+    states = [torch.load(io.BytesIO(x)) for x in (before, archive(env.state_dict()))]
+    for state in states:
+        del state["recordings"], state["curiosity"]["read"]
+    assert archive(states[0]) == archive(states[1])
+
+
+# --- β ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "beta",
+    [
+        1.0,
+        {"kind": "constant", "value": 0.25},
+        {"kind": "exponential", "initial": 0.5, "decay": 0.5, "floor": 0.1},
+        RANDOM,
+        BANDIT,
+    ],
+)
+def test_beta_holds_for_an_episode(beta):
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), beta)
+    betas, episode = [], set()
+    for _, _, terminated, truncated, info in play(env, 400):
+        episode.add(info["beta"])
+        if terminated or truncated:
+            assert len(episode) == 1
+            betas.append(episode.pop())
+    if beta == 1.0:
+        assert set(betas) == {1.0}
+    elif beta is RANDOM:
+        assert betas == Streams(0)["beta"].uniform(0.2, 0.7, len(betas)).tolist()
+    elif beta is BANDIT:
+        assert betas[:2] == [0.1, 0.5] and set(betas) == {0.1, 0.5}
+    elif beta["kind"] == "exponential":
+        assert betas == [max(0.1, 0.5 * 0.5**n) for n in range(len(betas))]
+
+
+class Learner(BetaController):
+    """A rule of the user's own that asks for policy gradients."""
+
+    learns = True
+    beta = 0.5
+
+    def __init__(self, generator):
+        pass
+
+    def next_episode(self, episode, bonus):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+class Obedient(Learner):
+    """One that does not; it notes what it is shown."""
+
+    learns = False
+
+    def __init__(self, generator, beta):
+        self.beta, self.shown = beta, []
+
+    def next_episode(self, episode, bonus):
+        self.shown.append((episode, bonus))
+
+
+def test_a_rule_of_the_user_s_own_sees_whole_episodes():
+    rule = {"kind": "custom", "rule": "test_wrappers:Obedient", "arguments": {"beta": 0.5}}
+    env = CuriosityReward(gymnasium.make("Pendulum-v1"), rule)
+    found = play(env, 450)
+    (first, bonus), (second, _) = env.appraisal.controller.shown
+    assert len(first) == len(second) == 200 and not first.terminated
+    assert first.actions.shape == (200, 1) and first.actions.dtype == np.float32
+    assert bonus.tolist() == [info["curiosity"] for *_, info in found[:200]]
+    assert first.rewards.tolist() == [info["reward_extrinsic"] for *_, info in found[:200]]
+    assert (first.observations[1:] == [item[0] for item in found[:200]]).all()
+    rule["arguments"]["beta"] = 1.5
+    with pytest.raises(NonFiniteError, match=r"β is 1\.5"):
+        play(CuriosityReward(gymnasium.make("Pendulum-v1"), rule), 1)
+
+
+class Everything(Novelty):
+    """A novelty of the user's own."""
+
+    def __init__(self, size, generator, value):
+        self.value = value
+
+    def __call__(self, states):
+        return np.full(len(states), self.value)
+
+    def observe(self, states):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+def test_a_novelty_of_the_user_s_own_is_asked_for_every_state():
+    def settings(value):
+        own = {"estimator": "test_wrappers:Everything", "arguments": {"value": value}}
+        return {"novelty": {"kind": "custom", **own}, "relevance": False}
+
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), **settings(0.25))
+    assert {info["curiosity"] for *_, info in play(env, 100)} == {0.25}
+    for value in (1.25, -0.5, np.nan):
+        env = CuriosityReward(gymnasium.make("CartPole-v1"), **settings(value))
+        with pytest.raises(NonFiniteError, match=f"the curiosity bonus is {value}"):
+            play(env, 1)
+
+
+# --- Gymnasium's and stable-baselines3's rules --------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.*(unwrapped version|infinity|We recommend|we recommend)")
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "DeepSea10-v0"])
+@pytest.mark.parametrize("played", [0, 450])
+def test_checkers_pass(name, played):
+    """Rendering is left out, as it takes pygame, which this project does not install.
+
+    The warnings let through are about the environment's own spaces, and that it is wrapped.
+    """
+    env = CuriosityReward(gymnasium.make(name))
+    if played:
+        play(env, played)
+    check_env(env, skip_render_check=True)
+    sb3_check_env(env)
+
+
+def test_spec_makes_the_same_again():
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), BANDIT, seed=4, **SMALL)
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(again, CuriosityReward)
+    for one, other in zip(play(env, 300), play(again, 300), strict=True):
+        np.testing.assert_equal(one, other)
+
+
+def test_step_before_reset_and_after_the_end_is_an_error():
+    env = CuriosityReward(gymnasium.make("CartPole-v1", disable_env_checker=True).unwrapped)
+    env.reset(seed=0)
+    while not env.step(0)[2]:
+        pass
+    env.env.steps_beyond_terminated = None  # no warning of the environment's own
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
+        env.step(0)
+
+
+# --- Several environments -----------------------------------------------------------------------
+
+MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
+@pytest.mark.parametrize("mode", MODES)
+def test_vector_form_of_one_equals_the_single_form(name, mode):
+    inside = SyncVectorEnv(
+        [lambda: CuriosityReward(gymnasium.make(name), RANDOM, seed=2)], autoreset_mode=mode
+    )
+    outside = VectorCuriosityReward(vector_of(name, 1, mode), RANDOM, seed=2)
+    ends = 0
+    for one, other in zip(play_vector(inside, 400), play_vector(outside, 400), strict=True):
+        for part in range(4):
+            np.testing.assert_array_equal(one[part], other[part])
+        told = one[4]
+        if mode is AutoresetMode.SAME_STEP and (one[2] | one[3]).any():
+            told, ends = one[4]["final_info"], ends + 1
+        for name_ in wrappers.PARTS:
+            mask = other[4][f"_{name_}"]
+            assert mask.tolist() == told.get(f"_{name_}", np.zeros(1, bool)).tolist()
+            if mask.any():
+                np.testing.assert_array_equal(told[name_], other[4][name_])
+    assert mode is AutoresetMode.NEXT_STEP or ends > 3
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
+def test_modes_of_autoreset_pay_alike(name):
+    """Three environments, whose resets take a step of their own or none: the same episodes."""
+
+    def episodes(mode):
+        env = VectorCuriosityReward(vector_of(name, 1, mode))
+        env.reset(seed=7)
+        numbers, found = iter(range(10**6)), []
+        waiting = False
+        while len(found) < 300:
+            action = 0 if waiting else np.random.default_rng(next(numbers)).integers(2)
+            _, reward, terminated, truncated, info = env.step(np.array([action]))
+            if not waiting:
+                found.append((reward[0], info["curiosity"][0]))
+            ended = bool(terminated[0] or truncated[0])
+            waiting = ended and mode is AutoresetMode.NEXT_STEP
+            if ended and mode is AutoresetMode.DISABLED:
+                env.reset(options={"reset_mask": np.array([True])})
+        return found
+
+    next_step, same_step, disabled = (episodes(mode) for mode in AutoresetMode)
+    assert next_step == same_step == disabled
+
+
+def test_what_one_environment_has_seen_is_known_to_the_others():
+    """Three chains side by side, whose episodes of 10 steps end together, one after the other."""
+    env = VectorCuriosityReward(vector_of("DeepSea10-v0", 3, AutoresetMode.SAME_STEP))
+    found = play_vector(env, 10)
+    assert all(info["novelty"].tolist() == [1, 1, 1] for *_, info in found)
+    again = env.step(np.full(3, np.random.default_rng(0).integers(2)))
+    count = sum(0.9995**k for k in (1, 2, 3))  # of the state that the first steps led to
+    assert again[4]["novelty"] == pytest.approx(np.full(3, 1 / (count + 1)))
+    # One step in 10 of these 30, and the last of each episode.
+    assert len(env.appraisal.curiosity.curiosity.memory) == 3 + 3
+
+
+def test_environments_that_end_at_other_times_keep_their_own_episodes():
+    env = VectorCuriosityReward(vector_of("CartPole-v1", 3, AutoresetMode.NEXT_STEP))
+    remembered = []
+    remember = env.appraisal.curiosity.remember
+    env.appraisal.curiosity.remember = lambda *given: (remembered.append(given), remember(*given))
+    found = play_vector(env, 300)
+    for i in range(3):
+        lengths, length = [], 0
+        for _, _, terminated, truncated, info in found:
+            length += int(info["_curiosity"][i])
+            if terminated[i] or truncated[i]:
+                lengths.append(length)
+                length = 0
+        assert len(lengths) > 5
+    starts = {episode.observations[0].tobytes() for episode, _ in remembered}
+    assert len(starts) == len(remembered) > 15
+    for episode, returns in remembered:  # 1 a step: (1 - γ^n) / (1 - γ) with n steps to go
+        to_go = np.arange(len(episode), 0, -1)
+        np.testing.assert_allclose(returns, (1 - 0.99**to_go) / (1 - 0.99))
+        moved = np.diff(episode.observations[:, 0])  # 0.02 s at the velocity before the step
+        np.testing.assert_allclose(moved, 0.02 * episode.observations[:-1, 1], atol=1e-6)
+
+
+# --- Resuming -----------------------------------------------------------------------------------
+
+
+def saved(state: dict) -> dict:
+    """Through a file's bytes."""
+    return torch.load(io.BytesIO(archive(state)), weights_only=True)
+
+
+@pytest.mark.parametrize("steps", [0, 7, 333, 600])
+@pytest.mark.parametrize(
+    ("name", "beta"), list(zip(ENVIRONMENTS, [0.4, RANDOM, BANDIT, 1], strict=True))
+)
+def test_saved_midway_it_continues_to_the_bit(name, beta, steps):
+    original = CuriosityReward(gymnasium.make(name), beta, seed=1, **SMALL)
+    play(original, steps)
+    state = saved(original.state_dict())
+    restored = CuriosityReward(copy.deepcopy(original.env), beta, seed=99, **SMALL)
+    restored.load_state_dict(state)
+    for number in range(500):
+        one, other = step(original, 1000 + number), step(restored, 1000 + number)
+        np.testing.assert_equal(one, other)
+        if one[2] or one[3]:
+            original.reset()
+            restored.reset()
+    assert archive(original.state_dict()) == archive(restored.state_dict())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_vector_form_saved_midway_continues_to_the_bit(mode):
+    env, action = vector_of("CartPole-v1", 3, mode), np.random.default_rng(0)
+    original = VectorCuriosityReward(env, RANDOM, **SMALL)
+    play_vector(original, 200)
+    restored = VectorCuriosityReward(copy.deepcopy(env), RANDOM, seed=9, **SMALL)
+    restored.load_state_dict(saved(original.state_dict()))
+    for _ in range(200):
+        actions = action.integers(2, size=3)
+        one, other = original.step(actions), restored.step(actions)
+        np.testing.assert_equal(one[:4], other[:4])
+        for part in wrappers.PARTS:
+            np.testing.assert_array_equal(one[4][part], other[4][part])
+
+
+def test_a_state_stays_as_it_was_while_the_training_goes_on():
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), BANDIT, **SMALL)
+    play(env, 300)
+    state = env.state_dict()
+    before = archive(copy.deepcopy(state))
+    play(env, 300)
+    assert archive(state) == before
+    env.load_state_dict(state)
+    play(env, 300)
+    assert archive(state) == before
+
+
+def test_a_state_made_with_other_settings_is_refused():
+    state = CuriosityReward(gymnasium.make("CartPole-v1")).state_dict()
+    message = re.escape("made with beta {'kind': 'constant', 'value': 0.4}, but here it is")
+    with pytest.raises(ConfigError, match=message):
+        CuriosityReward(gymnasium.make("CartPole-v1"), 0.5).load_state_dict(state)
+    with pytest.raises(ConfigError, match="made with observation_size 4, but here it is 6"):
+        CuriosityReward(gymnasium.make("Acrobot-v1")).load_state_dict(state)
+    two = VectorCuriosityReward(vector_of("CartPole-v1", 2, AutoresetMode.NEXT_STEP))
+    with pytest.raises(ConfigError, match="made with environments 1, but here it is 2"):
+        two.load_state_dict(state)
+
+
+def test_equal_seeds_give_equal_rewards_and_others_do_not():
+    first, second, third = (
+        [item[1] for item in play(CuriosityReward(gymnasium.make("Acrobot-v1"), seed=seed), 1500)]
+        for seed in (1, 1, 2)
+    )
+    assert first == second != third
+
+
+# --- Mistakes -----------------------------------------------------------------------------------
+
+
+def test_defaults_are_the_study_s():
+    training = yaml.safe_load((ROOT / "config.yaml").read_text(encoding="utf-8"))["training"]
+    assert training["memory"] == MEMORY and training["novelty"] == NOVELTY
+    assert training["ppo"]["discount"] == 0.99
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"beta": {"kind": "meta", "initial": 0.4}}, "meta network learns from policy gradients"),
+        (
+            {"beta": {"kind": "custom", "rule": "test_wrappers:Learner"}},
+            "beta.rule has 'test_wrappers:Learner', which learns from policy gradients",
+        ),
+        ({"beta": {"kind": "none"}}, "'none'.*'constant', 'random', 'bandit'"),
+        ({"beta": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
+        ({"beta": "big"}, "beta.value is 'big', but .* number"),
+        ({"memory": {"capcity": 5}}, "unknown key 'memory.capcity' .* 'capacity'"),
+        ({"memory": 5}, "memory is 5, but"),
+        ({"novelty": {"kind": "counts"}}, "novelty.kind is 'counts', but the observations are Box"),
+        ({"novelty": {"neighbours": [9000]}}, "neighbours has 9000, which must be less than"),
+        ({"gamma": 0.9}, "unknown key 'gamma' .* nearest known key is 'beta|memory'"),
+        ({"discount": 1.1}, "discount is 1.1, but .* less than or equal to 1"),
+        ({"seed": -1}, "seed is -1, but .* greater than or equal to 0"),
+        ({"rollout_steps": 0}, "rollout_steps is 0, but .* greater than 0"),
+    ],
+)
+@pytest.mark.parametrize("vector", [False, True])
+def test_mistakes_get_one_line(settings, message, vector):
+    with pytest.raises(ConfigError, match=message) as caught:
+        if vector:
+            VectorCuriosityReward(vector_of("CartPole-v1", 1, AutoresetMode.NEXT_STEP), **settings)
+        else:
+            CuriosityReward(gymnasium.make("CartPole-v1"), **settings)
+    assert "\n" not in str(caught.value)
+
+
+class Odd(gymnasium.Env):
+    """Goes wrong in its third step, or has spaces that do not work."""
+
+    def __init__(self, observations=None, actions=None, reward=0.0, state=0.0) -> None:
+        self.observation_space = observations or Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = actions or Discrete(2)
+        self.reward, self.state = reward, state
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        bad = self.steps == 3
+        state = np.full(2, self.state if bad else 0.0, np.float32)
+        return state, self.reward if bad else 0.0, self.steps == 5, False, {}
+
+
+@pytest.mark.parametrize(
+    ("spaces", "message"),
+    [
+        ({"observations": gymnasium.spaces.MultiBinary(3)}, "has multibinary observations"),
+        ({"observations": Box(0, 255, (8, 8, 3), np.uint8)}, "has image observations"),
+        ({"actions": gymnasium.spaces.MultiDiscrete([2, 2])}, "has actions MultiDiscrete"),
+    ],
+)
+def test_spaces_that_do_not_work_get_one_line(spaces, message):
+    with pytest.raises(ConfigError, match=message):
+        CuriosityReward(Odd(**spaces))
+
+
+def test_a_vector_environment_has_to_say_how_it_resets():
+    env = vector_of("CartPole-v1", 1, AutoresetMode.NEXT_STEP)
+    env.metadata = {}
+    with pytest.raises(ConfigError, match="should be one of gymnasium"):
+        VectorCuriosityReward(env)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    ("where", "message"), [("reward", "the reward is .* after step 3"), ("state", "an observation")]
+)
+def test_numbers_that_go_bad_stop_it(where, message, value):
+    env = CuriosityReward(Odd(**{where: value}))
+    with pytest.raises(NonFiniteError, match=message):
+        play(env, 5)
+
+
+def test_a_state_that_is_not_finite_is_noticed_at_once_when_novelty_is_estimated():
+    env = CuriosityReward(Odd(state=np.nan), novelty={"neighbours": [1], "write_every": 1})
+    env.env.state = 0.0
+    play(env, 20)
+    env.env.state = np.nan
+    with pytest.raises(NonFiniteError, match="the curiosity bonus is nan"):
+        play(env, 3)
