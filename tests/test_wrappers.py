@@ -1,6 +1,7 @@
 """Curiosity for other agents: what is paid, by the trainer's own bonus; checkers; resuming."""
 
 import copy
+import inspect
 import io
 import re
 from pathlib import Path
@@ -14,6 +15,7 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
 
 import mace_rl.environments  # noqa: F401  (registers ours)
 from mace_rl import wrappers
@@ -23,7 +25,7 @@ from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.novelty import Novelty
 from mace_rl.config.run import MemoryConfig, NoveltyConfig, RandomBeta
 from mace_rl.config.section import ConfigError
-from mace_rl.config.wrappers import MEMORY, NOVELTY
+from mace_rl.config.wrappers import MEMORY, NOVELTY, CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
@@ -539,7 +541,6 @@ def test_defaults_are_the_study_s():
         ({"memory": 5}, "memory is 5, but"),
         ({"novelty": {"kind": "counts"}}, "novelty.kind is 'counts', but the observations are Box"),
         ({"novelty": {"neighbours": [9000]}}, "neighbours has 9000, which must be less than"),
-        ({"gamma": 0.9}, "unknown key 'gamma' .* nearest known key is 'beta|memory'"),
         ({"discount": 1.1}, "discount is 1.1, but .* less than or equal to 1"),
         ({"seed": -1}, "seed is -1, but .* greater than or equal to 0"),
         ({"rollout_steps": 0}, "rollout_steps is 0, but .* greater than 0"),
@@ -555,10 +556,33 @@ def test_mistakes_get_one_line(settings, message, vector):
     assert "\n" not in str(caught.value)
 
 
+def test_arguments_that_there_are_not():
+    """Python's own message; help() and editors show those that there are, the same for both."""
+    with pytest.raises(TypeError, match="unexpected keyword argument 'gamma'"):
+        CuriosityReward(gymnasium.make("CartPole-v1"), gamma=0.9)
+    single, vector = (
+        list(inspect.signature(wrapper).parameters.values())[1:]
+        for wrapper in (CuriosityReward, VectorCuriosityReward)
+    )
+    assert single == vector
+    assert {one.name for one in single} == set(CuriosityConfig.model_fields)
+    for one in single:
+        field = CuriosityConfig.model_fields[one.name]
+        assert field.is_required() or field.default == one.default
+
+
+@pytest.mark.parametrize("wrapper", [CuriosityReward, VectorCuriosityReward])
+def test_what_is_no_environment_of_gymnasium_s_is_refused(wrapper):
+    """stable-baselines3's several environments are none; `wrapper_class` is the way there."""
+    with pytest.raises(TypeError, match="Expected env to be a `gymnasium"):
+        wrapper(make_vec_env("CartPole-v1", 2))
+
+
 class Odd(gymnasium.Env):
     """Goes wrong in its third step, or has spaces that do not work."""
 
-    def __init__(self, observations=None, actions=None, reward=0.0, state=0.0) -> None:
+    def __init__(self, observations=None, actions=None, reward=0.0, state=0.0, size=2) -> None:
+        self.size = size
         self.observation_space = observations or Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = actions or Discrete(2)
         self.reward, self.state = reward, state
@@ -571,7 +595,7 @@ class Odd(gymnasium.Env):
     def step(self, action):
         self.steps += 1
         bad = self.steps == 3
-        state = np.full(2, self.state if bad else 0.0, np.float32)
+        state = np.full(self.size if bad else 2, self.state if bad else 0.0, np.float32)
         return state, self.reward if bad else 0.0, self.steps == 5, False, {}
 
 
@@ -586,6 +610,38 @@ class Odd(gymnasium.Env):
 def test_spaces_that_do_not_work_get_one_line(spaces, message):
     with pytest.raises(ConfigError, match=message):
         CuriosityReward(Odd(**spaces))
+
+
+@pytest.mark.parametrize("size", [0, 1, 3])
+def test_an_observation_of_another_shape_is_refused(size):
+    """One of size 1 too, which numpy would stretch."""
+    message = rf"gave an observation of shape \({size},\), but its observation_space is Box"
+    with pytest.raises(ConfigError, match=message):
+        play(CuriosityReward(Odd(size=size)), 5)
+
+
+class Numbers(gymnasium.Env):
+    """Observations 5, 6, 7, …, of which the space has three."""
+
+    observation_space, action_space = Discrete(3, start=5), Discrete(2)
+
+    def __init__(self, first) -> None:
+        self.number = first
+
+    def reset(self, *, seed=None, options=None):
+        return self.number, {}
+
+    def step(self, action):
+        self.number += 1
+        return self.number, 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(("first", "good", "bad"), [(5, 2, 8), (4, 0, 4)])
+def test_a_number_outside_its_space_is_refused(first, good, bad):
+    env = CuriosityReward(Numbers(first))
+    with pytest.raises(ConfigError, match=f"gave an observation of number {bad}, but its obs"):
+        play(env, good + 1)
+    assert env.env.number == bad
 
 
 def test_a_vector_environment_has_to_say_how_it_resets():

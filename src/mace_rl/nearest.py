@@ -24,7 +24,7 @@ def nearest(
 
 
 @njit(cache=True, error_model="numpy")
-def in_columns(points, mean, std):
+def in_columns(points: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     """`points` as `nearest_in_columns` takes them, for searches among the same ones, float32."""
     # Points on columns, so that inner loops run along contiguous memory; dimensions four at a time,
     # to load and store the sums less often, filled up with zeros.
@@ -38,7 +38,9 @@ def in_columns(points, mean, std):
 
 
 @njit(cache=True, error_model="numpy")
-def nearest_in_columns(queries, columns, mean, std, count):
+def nearest_in_columns(
+    queries: np.ndarray, columns: np.ndarray, mean: np.ndarray, std: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """`nearest` of the points that `in_columns` was given, with the same `mean` and `std`."""
     padded, total = columns.shape
     rows = np.zeros((len(queries), padded), np.float32)

@@ -1,5 +1,7 @@
 """The curiosity bonus for any agent: wrappers that add β · R_curiosity to an environment's reward.
 
+    env = CuriosityReward(gymnasium.make("FrozenLake-v1"))  # and everything else as without
+
     reward = R_extrinsic + β · u · R_curiosity,      u = s_E / s_I
 
 R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages, each in units of
@@ -30,6 +32,7 @@ from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.stepwise import StepwiseCuriosity
+from mace_rl.config.run import CustomBeta
 from mace_rl.config.section import ConfigError, check, short
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
@@ -46,30 +49,51 @@ PARTS = ("reward_extrinsic", "reward_curiosity", "curiosity", "novelty", "releva
 class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
-    env: with vectors (Box) or Discrete observations and actions; Gymnasium's `FlattenObservation`
-        makes vectors of others. Its episodes have to end, if need be by a time limit: nothing is
-        learnt from one that does not.
-    beta: a number, or a rule that sets β for each episode, as in config.yaml: {"kind":
+    env: observations are arrays of one shape (Box; they are flattened) or Discrete, actions are
+        Discrete or one-dimensional; Gymnasium's `FlattenObservation` makes vectors of others. Its
+        episodes have to end, if need be by a time limit: nothing is learnt from one that does not.
+    beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …}, "random", "bandit", "custom". Not "meta", which learns from policy
         gradients.
-    settings: any of `CuriosityConfig`: `relevance=False` for novelty alone; `memory` and `novelty`,
-        what differs from the study's; `discount`, γ of the agent, 0.99; `rollout_steps` between its
-        updates, for a bandit; `seed` of what is drawn here. `reset(seed=…)` is the environment's.
+    relevance: False for novelty alone, without the memory.
+    memory, novelty: what differs from the study's settings (`mace_rl.config.wrappers`), by name.
+    discount: γ of the agent (gamma in stable-baselines3), per step.
+    rollout_steps: steps between the agent's updates (n_steps there); only a bandit asks for it.
+    seed: of what is drawn here; `reset(seed=…)` is the environment's.
 
-    `info` of a step gets `PARTS`: `reward_extrinsic` and `reward_curiosity`, whose sum is the
-    reward; R_curiosity, as `curiosity`, with its factors `novelty` and `relevance`; and `beta`.
+    `info` of a step gets `PARTS`, each a float: `reward_extrinsic` and `reward_curiosity`, whose
+    sum is the reward, in the environment's unit; R_curiosity in [0, 1], as `curiosity`, with its
+    factors `novelty` and `relevance`; and `beta`.
 
     Memory holds the discounted return-to-go of each state until the episode ended. The trainer's
     λ-returns take a critic: here what a time limit cut off counts as nothing.
 
-    Raises `ConfigError` for settings and spaces that do not work, and `NonFiniteError` for a reward
-    or a bonus that is not a number.
+    Raises `ConfigError`, one line, for settings and spaces that do not work and observations that
+    are not of their space's size, and `NonFiniteError` for a reward, an observation or a bonus that
+    is not a number.
     """
 
     def __init__(
-        self, env: gymnasium.Env[Any, Any], beta: float | Settings = 0.4, **settings: Any
+        self,
+        env: gymnasium.Env[Any, Any],
+        beta: float | Settings = 0.4,
+        *,
+        relevance: bool = True,
+        memory: Settings | None = None,
+        novelty: Settings | None = None,
+        discount: float = 0.99,
+        rollout_steps: int = 1,
+        seed: int = 0,
     ) -> None:
-        settings = {"beta": beta, **settings}
+        settings = given(
+            beta=beta,
+            relevance=relevance,
+            memory=memory,
+            novelty=novelty,
+            discount=discount,
+            rollout_steps=rollout_steps,
+            seed=seed,
+        )
         RecordConstructorArgs.__init__(self, **settings)  # for `spec`, from which it can be remade
         gymnasium.Wrapper.__init__(self, env)
         config = check(CuriosityConfig, settings, type(self).__name__)
@@ -116,8 +140,26 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
     """
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], beta: float | Settings = 0.4, **settings: Any
+        self,
+        env: VectorEnv[Any, Any, Any],
+        beta: float | Settings = 0.4,
+        *,
+        relevance: bool = True,
+        memory: Settings | None = None,
+        novelty: Settings | None = None,
+        discount: float = 0.99,
+        rollout_steps: int = 1,
+        seed: int = 0,
     ) -> None:
+        settings = given(
+            beta=beta,
+            relevance=relevance,
+            memory=memory,
+            novelty=novelty,
+            discount=discount,
+            rollout_steps=rollout_steps,
+            seed=seed,
+        )
         super().__init__(env)
         self.mode = env.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
@@ -125,12 +167,12 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
                 f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'], "
                 "but it should be one of gymnasium.vector.AutoresetMode"
             )
-        config = check(CuriosityConfig, {"beta": beta, **settings}, type(self).__name__)
+        config = check(CuriosityConfig, settings, type(self).__name__)
         spaces = Spaces(name_of(env), env.single_observation_space, env.single_action_space)
         self.appraisal = Appraisal(config, spaces, self.num_envs)
 
     def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """The environments' reset; of those in `options["reset_mask"]` if that is there."""
         chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
@@ -150,19 +192,19 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
         fresh = np.zeros(self.num_envs, np.bool_)
         if self.mode is AutoresetMode.NEXT_STEP:
             fresh = ~self.appraisal.going_on()
-        played = np.flatnonzero(~fresh).tolist()
+        played = [i for i, new in enumerate(fresh.tolist()) if not new]
         paid = [self.appraisal.pay(i, actions[i], float(rewards[i]), reached[i]) for i in played]
         for i in np.flatnonzero(ended).tolist():
             self.appraisal.end(i, bool(terminated[i]))
         for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
             self.appraisal.begin(i, observations[i])
-        parts = {name: np.zeros(self.num_envs) for name in PARTS}
-        for i, values in zip(played, paid, strict=True):
-            for name in PARTS:
-                parts[name][i] = values[name]
-        masks = {f"_{name}": ~fresh for name in PARTS}
-        total = np.where(fresh, rewards, parts["reward_extrinsic"] + parts["reward_curiosity"])
-        return observations, total, terminated, truncated, {**infos, **parts, **masks}
+        values = np.zeros((len(PARTS), self.num_envs))
+        for i, parts in zip(played, paid, strict=True):
+            values[:, i] = [parts[name] for name in PARTS]
+        total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
+        told = dict(zip(PARTS, values, strict=True))
+        masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)
+        return observations, total, terminated, truncated, {**infos, **told, **masks}
 
     def state_dict(self) -> dict[str, Any]:
         """See `CuriosityReward`."""
@@ -184,7 +226,7 @@ class Appraisal:
         curiosity = Curiosity(memory, config.novelty, "compiled", space, size, streams)
         self.curiosity = StepwiseCuriosity(curiosity, environments)
         self.controller = beta_rule(config.beta, config.rollout_steps, streams["beta"])
-        if self.controller.learns:
+        if isinstance(config.beta, CustomBeta) and self.controller.learns:
             raise ConfigError(
                 f"beta.rule has {config.beta.rule!r}, which learns from policy gradients, but only "
                 "our trainer has these"
@@ -192,8 +234,10 @@ class Appraisal:
         self.extrinsic_scale = RewardScale(config.discount, 1.0)
         self.curiosity_scale = RewardScale(config.discount, TINY)
         self.recordings: list[Recording | None] = [None] * environments
-        actions = spaces.action_space
-        self.first_action = int(actions.start) if isinstance(actions, Discrete) else None
+        self.first_observation, self.first_action = (
+            int(space.start) if isinstance(space, Discrete) else None  # of the numbers
+            for space in (spaces.observation_space, spaces.action_space)
+        )
 
     @property
     def unit(self) -> float:
@@ -208,9 +252,9 @@ class Appraisal:
 
     def begin(self, environment: int, observation: Any) -> None:
         """An episode begins; what was played of another is forgotten."""
+        first = self.encode(observation)
         beta = self.controller.beta
         require_share("β", beta)
-        first = self.spaces.encode(observation)
         self.recordings[environment] = Recording(first, beta, self.unit)
         self.curiosity.begin(environment)
 
@@ -223,7 +267,7 @@ class Appraisal:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
         if not math.isfinite(reward):
             require_finite("the reward", reward, f" after step {len(recording) + 1}")
-        state = recording.add(self.action(action), reward, self.spaces.encode(observation))
+        state = recording.add(self.action(action), reward, self.encode(observation))
         bonus, novelty, relevance = self.curiosity.bonus(state, environment)
         if not 0 <= bonus <= 1:
             require_share("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
@@ -238,6 +282,23 @@ class Appraisal:
             "beta": recording.beta,
         }
 
+    def encode(self, observation: Any) -> np.ndarray:
+        """A float32 vector, [observation_size]; `ConfigError` for what is not of the space."""
+        spaces = self.spaces
+        if self.first_observation is None:
+            vector = np.asarray(observation, np.float32)
+            if vector.size == spaces.observation_size:
+                return vector.ravel()
+            found = f"shape {vector.shape}"
+        else:
+            if 0 <= int(observation) - self.first_observation < spaces.observation_size:
+                return spaces.encode(observation)
+            found = f"number {observation}"
+        raise ConfigError(
+            f"environment {spaces.name!r} gave an observation of {found}, but its "
+            f"observation_space is {spaces.observation_space}"
+        )
+
     def action(self, action: Any) -> Any:
         """As an `Episode` has it: an int from 0, or float32 [actions], a copy."""
         if self.first_action is None:
@@ -247,6 +308,7 @@ class Appraisal:
     def end(self, environment: int, terminated: bool) -> None:
         """The episode becomes memory, and β is set anew."""
         recording = self.recordings[environment]
+        assert recording is not None
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
         require_finite("an observation", episode.observations)
@@ -351,6 +413,11 @@ class Recording:
             recording.add(action, reward, observation)
         recording.bonus = list(state["bonus"])
         return recording
+
+
+def given(**settings: Any) -> dict[str, Any]:
+    """Those that are not None."""
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def name_of(env: Any) -> str:

@@ -13,9 +13,10 @@ import torch
 from numba import njit
 
 from mace_rl.agent.kernels import forward
+from mace_rl.agent.network import CompiledMLP
 from mace_rl.bonus.curiosity import SMALLEST_SPAN, Curiosity
 from mace_rl.bonus.density import SMALLEST_LOG_STD, gaussian_log_probs
-from mace_rl.bonus.memory import recollect
+from mace_rl.bonus.memory import EpisodicMemory, recollect
 from mace_rl.bonus.novelty import CountNovelty, DensityNovelty
 from mace_rl.environments.rollout import Episode
 from mace_rl.nearest import in_columns, nearest_in_columns
@@ -79,16 +80,18 @@ class StepwiseCuriosity:
             self._visited = visited(novelty)
             nobody = np.full(max(novelty.config.neighbours), -1)
             self._near = [nobody.copy() for _ in self.visits]  # for each episode
-        stored = 0 if memory is None else len(memory)
-        self._newest_first = np.argsort(-memory.number[:stored]) if stored else np.empty(0, int)
-        self._read = np.zeros(stored, np.bool_)  # entries in that order, since they were laid out
-        self._remembered = self._memory() if stored else None  # arguments of `memory_relevance`
+        self._newest_first = np.empty(0, np.int64)
+        self._remembered: tuple[Any, ...] | None = None  # arguments of `memory_relevance`
+        if memory is not None and len(memory) > 0:
+            self._newest_first = np.argsort(-memory.number[: len(memory)])
+            self._remembered = self._memory(memory)
+        # Entries in that order: whether they were read since they were laid out.
+        self._read = np.zeros(len(self._newest_first), np.bool_)
         self._known: dict[int, float] = {}  # relevance of discrete states, as far as asked for
 
-    def _memory(self) -> tuple[Any, ...]:
-        curiosity, memory = self.curiosity, self.curiosity.memory
-        mean = curiosity.normaliser.mean.astype(np.float32)
-        scale = curiosity.scale().astype(np.float32)
+    def _memory(self, memory: EpisodicMemory) -> tuple[Any, ...]:
+        mean = self.curiosity.normaliser.mean.astype(np.float32)
+        scale = self.curiosity.scale().astype(np.float32)
         keys = memory.keys.numpy()[self._newest_first]
         returns = memory.values.numpy()[self._newest_first, -1:]
         return (
@@ -121,6 +124,7 @@ class StepwiseCuriosity:
 def visited(novelty: DensityNovelty) -> tuple[Any, ...]:
     """What `density_novelty` compares states with to agree with `novelty` as it is now."""
     config, network = novelty.config, novelty.density.network
+    assert isinstance(network, CompiledMLP)  # `StepwiseCuriosity` asks for that
     mean, std = novelty.normaliser.mean, novelty.normaliser.std
     return (
         in_columns(novelty.visited, mean.astype(np.float32), std.astype(np.float32)),
@@ -131,19 +135,19 @@ def visited(novelty: DensityNovelty) -> tuple[Any, ...]:
 
 @njit(cache=True, error_model="numpy")
 def density_novelty(
-    state,
-    near,
-    columns,
-    mean,
-    std,
-    neighbours,
-    usual_distances,
-    knn_weight,
-    parameters,
-    sizes,
-    usual_log_density,
-    dimensions,
-):
+    state: np.ndarray,
+    near: np.ndarray,
+    columns: np.ndarray,
+    mean: np.ndarray,
+    std: np.ndarray,
+    neighbours: np.ndarray,
+    usual_distances: np.ndarray,
+    knn_weight: float,
+    parameters: np.ndarray,
+    sizes: np.ndarray,
+    usual_log_density: float,
+    dimensions: float,
+) -> float:
     """`DensityNovelty` of one state, float32 [size]; NaN where that is not finite.
 
     near: int64 [largest k], see `knn_novelty`; columns: the visited states, by `in_columns`; mean,
@@ -168,7 +172,15 @@ def density_novelty(
 
 
 @njit(cache=True, error_model="numpy")
-def knn_novelty(state, near, columns, mean, std, neighbours, usual_distances):
+def knn_novelty(
+    state: np.ndarray,
+    near: np.ndarray,
+    columns: np.ndarray,
+    mean: np.ndarray,
+    std: np.ndarray,
+    neighbours: np.ndarray,
+    usual_distances: np.ndarray,
+) -> float:
     """`DensityNovelty.knn_novelty` of one state; arguments as in `density_novelty`.
 
     near: some places in `columns`, the first -1 for none; those of the nearest states when they
@@ -199,7 +211,9 @@ def knn_novelty(state, near, columns, mean, std, neighbours, usual_distances):
 
 
 @njit(cache=True, error_model="numpy")
-def knn_share(squared_distances, neighbours, usual_distances):
+def knn_share(
+    squared_distances: np.ndarray, neighbours: np.ndarray, usual_distances: np.ndarray
+) -> float:
     """What follows from the squared distances, ascending, to the nearest states."""
     sums = np.empty(len(squared_distances))
     total = 0.0
@@ -215,8 +229,17 @@ def knn_share(squared_distances, neighbours, usual_distances):
 
 @njit(cache=True, error_model="numpy")
 def memory_relevance(
-    state, read, columns, mean, scale, neighbours, returns, bandwidth, worst, best
-):
+    state: np.ndarray,
+    read: np.ndarray,
+    columns: np.ndarray,
+    mean: np.ndarray,
+    scale: np.ndarray,
+    neighbours: int,
+    returns: np.ndarray,
+    bandwidth: float,
+    worst: float,
+    best: float,
+) -> float:
     """Memory relevance of one state, float32 [size]: `EpisodicMemory.lookup`, then `relevance`.
 
     columns: the memory's keys, by `in_columns` with `mean` and `scale`, float32 [size]; returns:

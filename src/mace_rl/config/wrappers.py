@@ -10,8 +10,13 @@ from mace_rl.config.run import BetaRule, MemoryConfig, NoveltyConfig
 from mace_rl.config.section import Section
 
 # The study's; `config.yaml` says whose each value is.
-MEMORY = {"capacity": 1000, "neighbours": 10, "kernel_bandwidth": 0.1, "write_every": 10}
-NOVELTY = {
+MEMORY: dict[str, Any] = {
+    "capacity": 1000,
+    "neighbours": 10,
+    "kernel_bandwidth": 0.1,
+    "write_every": 10,
+}
+NOVELTY: dict[str, Any] = {
     "kind": "auto",
     "count_decay": 0.9995,
     "buffer_size": 5000,
@@ -40,7 +45,7 @@ class CuriosityConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _over_the_study_s(cls, values: dict[str, Any]) -> dict[str, Any]:
-        for section, defaults in {"memory": MEMORY, "novelty": NOVELTY}.items():
+        for section, defaults in (("memory", MEMORY), ("novelty", NOVELTY)):
             given = values.get(section, {})
             if isinstance(given, Mapping):
                 values = {**values, section: merge(defaults, given)}

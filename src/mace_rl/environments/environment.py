@@ -63,7 +63,6 @@ class Environment(Spaces):
                 f"environment {name!r} has no time limit (max_episode_steps), so its episodes "
                 "need not end; set one"
             )
-        self.name = name
         self.max_steps: int = spec.max_episode_steps
         with nothing_printed():
             try:

@@ -30,6 +30,7 @@ class Spaces:
             raise ConfigError(
                 f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box work"
             )
+        self.name = name
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
         self.observation_size = (
