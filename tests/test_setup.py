@@ -62,7 +62,7 @@ def test_lock_is_complete_and_is_what_is_installed():
 
 def test_every_import_is_declared():
     """A module of another package is imported only if pyproject.toml names that package."""
-    folders = ("src", "tests", "tools", "workflow", "benchmarks")
+    folders = ("src", "tests", "tools", "workflow", "benchmarks", "examples")
     sources = [path for folder in folders for path in (ROOT / folder).rglob("*.*")]
     own = {path.stem for path in [*sources, *(ROOT / "src").iterdir()]} | set(folders)
     declared = {canonicalize_name(Requirement(line).name) for line in DECLARED}

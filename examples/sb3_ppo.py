@@ -1,0 +1,72 @@
+"""stable-baselines3's PPO on an exploration task, without and with the curiosity reward.
+
+Prints the mean extrinsic return of all episodes and of the last tenth of them, for each seed, then
+their means over the seeds and the differences, with 95 % intervals.
+"""
+
+import argparse
+
+import mace_rl  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+
+from mace_rl.results.statistics import mean_interval, paired_comparison
+from mace_rl.wrappers import CuriosityReward
+
+MEASURES = ("all episodes", "last tenth")
+
+
+def train(environment: str, curious: bool, seed: int, steps: int) -> np.ndarray:
+    """The extrinsic returns of all episodes of a training, [episodes]."""
+    monitor = Monitor(gymnasium.make(environment))  # inside, so that it sees extrinsic rewards
+    env = CuriosityReward(monitor, beta=0.4, seed=seed) if curious else monitor
+    agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=seed, device="cpu")
+    agent.learn(steps)
+    return np.array(monitor.get_episode_rewards())
+
+
+def main() -> None:
+    """Train with every seed, and print what came out as a table in Markdown."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="example: python examples/sb3_ppo.py --seeds 2 --first-seed 1000",
+    )
+    parser.add_argument("--environment", default="DeepSea10-v0", help="default: %(default)s")
+    parser.add_argument("--steps", type=int, default=12_000, help="default: %(default)s")
+    parser.add_argument("--seeds", type=int, default=10, help="how many, default: %(default)s")
+    parser.add_argument("--first-seed", type=int, default=0, help="default: %(default)s")
+    arguments = parser.parse_args()
+    if arguments.seeds < 1 or arguments.steps < 1 or arguments.first_seed < 0:
+        parser.error("--seeds and --steps should be at least 1, --first-seed at least 0")
+    torch.set_num_threads(1)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    found = np.empty((len(MEASURES), 2, len(seeds)))  # without and with curiosity
+    heads = [f"{agent}: {name}" for name in MEASURES for agent in ("PPO", "with curiosity")]
+    print("| seed |", " | ".join(heads), "|")
+    print("| --- |", " | ".join(["--:"] * len(heads)), "|", flush=True)
+    for i, seed in enumerate(seeds):
+        for curious in (False, True):
+            returns = train(arguments.environment, curious, seed, arguments.steps)
+            last = returns[-max(len(returns) // 10, 1) :]
+            found[:, int(curious), i] = returns.mean(), last.mean()
+        row = [f"{value:.2f}" for value in found[:, :, i].ravel()]
+        print("|", " | ".join([str(seed), *row]), "|", flush=True)
+    rng = np.random.default_rng(0)
+    cells = []
+    for values in found.reshape(-1, len(seeds)):
+        low, high = mean_interval(values, 0.95, 10_000, rng)
+        cells.append(f"{values.mean():.2f} ({low:.2f} to {high:.2f})")
+    print("| mean |", " | ".join(cells), "|\n")
+    for name, (without, with_curiosity) in zip(MEASURES, found, strict=True):
+        gain = paired_comparison(with_curiosity, without, 0.95, 10_000, rng)
+        interval = f"{gain.difference:.2f} ({gain.low:.2f} to {gain.high:.2f})"
+        print(f"with curiosity minus without, {name}: {interval}, p = {gain.p_value:.4f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""examples/ and docs/wrappers.md: stable-baselines3's PPO trained with the curiosity reward."""
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+
+from mace_rl.wrappers import CuriosityReward
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "sb3_ppo.py"
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(EXAMPLE), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_prints_a_row_for_each_seed_and_what_came_out():
+    done = run("--seeds", "2", "--first-seed", "1000", "--steps", "256")
+    assert done.returncode == 0, done.stderr
+    assert re.findall(r"(?m)^\| (\w+) \|(?:[^|]+\|){4}$", done.stdout) == [
+        *("seed", "1000", "1001", "mean")
+    ]
+    assert "with curiosity minus without, last tenth: " in done.stdout
+
+
+def test_help_and_mistakes():
+    assert "example: python examples/sb3_ppo.py" in run("--help").stdout
+    done = run("--seeds", "0")
+    assert done.returncode == 2 and "--seeds and --steps should be at least 1" in done.stderr
+
+
+def test_curiosity_changes_the_policy_and_not_what_is_counted():
+    train = runpy.run_path(str(EXAMPLE))["train"]
+    without, with_curiosity = (train("DeepSea10-v0", curious, 1000, 1536) for curious in (0, 1))
+    own = {*np.round(-0.001 * np.arange(11), 6), 0.99}  # Deep Sea's own returns, without a bonus
+    for returns in (without, with_curiosity):
+        assert len(returns) >= 153 and set(np.round(returns, 6)) <= own
+    assert (without[:25] == with_curiosity[:25]).all()  # until the first update, after 256 steps
+    assert (without != with_curiosity).any()
+
+
+def test_what_the_page_shows_works(tmp_path, monkeypatch):
+    """Block after block, with a shorter training."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "wrappers.md").read_text(encoding="utf-8")
+    assert text.count("learn(10_000)") == 1
+    blocks = re.findall(
+        r"```python\n(.*?)```", text.replace("learn(10_000)", "learn(1)"), re.DOTALL
+    )
+    assert len(blocks) == 3
+    names = {}
+    for block in blocks:
+        exec(block, names)
+        env = names["env"]
+        assert len(env.appraisal.curiosity.curiosity.memory) > 0  # the restored one's, too
+    names["shared"].reset()
+    assert names["shared"].step(np.arange(4))[1].shape == (4,)
+    names["agent"].learn(1)
+
+
+def test_several_environments_of_stable_baselines3_s():
+    """Each has a curiosity of its own, and Monitor inside reports what is extrinsic."""
+    envs = make_vec_env(
+        "CartPole-v1", 2, seed=0, wrapper_class=CuriosityReward, wrapper_kwargs={"beta": 0.3}
+    )
+    agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=128, n_epochs=1, device="cpu")
+    agent.learn(512)
+    assert all(episode["r"] == episode["l"] for episode in agent.ep_info_buffer)
+    first, second = (env.appraisal.curiosity.curiosity.memory for env in unwrapped(envs))
+    assert len(first) > 0 < len(second) and first is not second
+
+
+def unwrapped(envs) -> list[gymnasium.Env]:
+    """The curiosity wrappers, which are the outermost."""
+    assert all(isinstance(env, CuriosityReward) for env in envs.envs)
+    return envs.envs
