@@ -10,6 +10,7 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
+from benchmarks import wrapper
 from benchmarks.breakdown import ALL_SECTIONS
 from benchmarks.settings import (
     ACROBOT,
@@ -47,9 +48,9 @@ RATIOS = (
 
 def measure_all(scale: Scale) -> None:
     """Write the document and the pictures of the data in `scale.data`, and summary.csv."""
-    names = ("results", "breakdown", "growth", "workflow", "planning")
+    names = ("results", "breakdown", "growth", "workflow", "planning", "wrapper")
     data = [pd.read_csv(scale.data / f"{name}.csv") for name in names]
-    results, times, growth, jobs, planning = data
+    results, times, growth, jobs, planning, costs = data
     summary = speed_summary(results)
     summary.to_csv(scale.data / "summary.csv", index=False)
     draw_speed(summary, scale)
@@ -65,6 +66,7 @@ def measure_all(scale: Scale) -> None:
         "breakdown": breakdown_table(times),
         "growth": growth_table(growth),
         "workflow": workflow_table(study, plan),
+        "wrapper": wrapper.table(costs),
     }
     text = filled((ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), tables)
     scale.document.write_text(text, encoding="utf-8")

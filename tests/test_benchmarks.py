@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import breakdown, growth, report, settings, speed
+from benchmarks import breakdown, growth, report, settings, speed, wrapper
 from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FULL, HOPPER, OURS, VARIANTS
 
 
@@ -52,6 +52,9 @@ def data(tmp_path):
     pd.concat(everywhere).to_csv(tmp_path / "workflow.csv")
     jobs.to_csv(tmp_path / "jobs.csv")
     pd.DataFrame({"runs": [3000], "seconds": [12.3]}).to_csv(tmp_path / "planning.csv")
+    index = pd.MultiIndex.from_product([wrapper.NAMES, wrapper.WHERE], names=["env", "where"])
+    costs = [pd.DataFrame({wrapper.TIME: time}, index) for time in (1.0, 3.0)]
+    pd.concat(costs).reset_index().to_csv(tmp_path / "wrapper.csv")
     return tmp_path
 
 
@@ -101,6 +104,7 @@ def test_report_is_written_from_the_data(data):
         "| ppo | 350 | 350 | 350 |",
         "| walk | 40 | 400 | 1110000.0 | 3.000 | 80 | 400 |",
         "| planning (`snakemake -n`) of 3000 runs | 12 s |  | ≤ 60 s | ≤ 20 s |",
+        f"| CartPole-v1 |{' 2.0 (1.0 to 3.0) |' * 5}",
     ):
         assert line in text
     assert "nan" not in text
@@ -151,6 +155,17 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()
+
+
+@pytest.mark.slow
+def test_wrapper_plays_the_trainer_s_episodes(monkeypatch):
+    played = []
+    replay = wrapper.replay
+    monkeypatch.setattr(wrapper, "replay", lambda *given: played.append(given[1]) or replay(*given))
+    found = wrapper.measure("DeepSea10-v0", 1000, 200)  # `replay` refuses episodes that go on
+    assert found.keys() == wrapper.WHERE.keys() and np.isfinite(list(found.values())).all()
+    assert {len(actions) for actions in played} == {10}
+    assert 0 < found["trainer"] < found["critic"] and found["vector"] > 0
 
 
 @pytest.mark.parametrize("walk", growth.WALKS)
