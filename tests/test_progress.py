@@ -4,6 +4,7 @@ import io
 import json
 import logging
 import math
+import os
 import subprocess
 import sys
 from itertools import product
@@ -243,6 +244,18 @@ def begin(handler: LogHandler, job: int, *wildcards: str, rule: str = "train", l
     tell(handler, event=LogEvent.JOB_INFO, **said)
 
 
+def fail(handler: LogHandler, *jobs: int, entry: Path | None = None) -> None:
+    """A job ends badly, or several that were an entry of a queue; `entry` is the entry's log."""
+    logs = [str(entry)] if entry else []
+    if len(jobs) > 1:
+        said = {"aux_logs": logs, "job_error_info": [{"jobid": job} for job in jobs]}
+        tell(handler, "Error in group", logging.ERROR, event=LogEvent.GROUP_ERROR, **said)
+    for job in jobs:
+        said = {"jobid": job, "log": handler.jobs[job].log + (logs if len(jobs) == 1 else [])}
+        said["indent"] = len(jobs) > 1
+        tell(handler, "Twenty lines", logging.ERROR, event=LogEvent.JOB_ERROR, **said)
+
+
 def shown(study: Study) -> list[str]:
     console = Console(file=io.StringIO(), width=100)
     console.print(study.table(0.0))
@@ -279,11 +292,11 @@ def test_what_a_study_shows(tmp_path: Path, handler: LogHandler) -> None:
     log = tmp_path / "a.log"
     log.write_text("2026-01-01 12:00:00,000 training A failed: No: reason\nTraceback\nNo: reason\n")
     begin(handler, 2, *runs[2][:3], log=log)
-    tell(handler, "Twenty lines", logging.ERROR, event=LogEvent.JOB_ERROR, jobid=2)
-    tell(handler, event=LogEvent.JOB_ERROR, jobid=0)  # there is no log
+    fail(handler, 2)
+    fail(handler, 0)  # there is no log
     log.write_text("training A: interrupted\n")
     begin(handler, 3, *runs[3][:3], log=log)
-    tell(handler, event=LogEvent.JOB_ERROR, jobid=3)
+    fail(handler, 3)
     begin(handler, 9, rule="metrics")
     tell(handler, event=LogEvent.JOB_FINISHED, job_id=9)
     ending = "1 of 4 runs done, 2 failed, 1 interrupted"
@@ -309,7 +322,70 @@ def test_runs_on_other_machines(tmp_path: Path, handler: LogHandler) -> None:
     assert shown(study) == ["0 of 1 runs done, 1 submitted; time left not known yet"]
     (tmp_path / "progress.json").write_text(json.dumps(reading(40, 60.0)))
     assert shown(study)[0] == "0 of 1 runs done, 1 running; time left not known yet"
+    (tmp_path / "progress.json").unlink()  # while others of its entry in the queue go on
+    assert shown(study)[0].startswith("0 of 1 runs done, 1 trained")
     handler.close()
+
+
+TIME_LIMIT = "slurmstepd: error: *** JOB 8 ON n1 CANCELLED AT 2026-01-01T12:00:00 DUE TO TIME LIMIT"
+
+
+@pytest.mark.parametrize(
+    ("entry", "word"),
+    [
+        (
+            f"{TIME_LIMIT} ***\nsrun: forcing job termination\n",
+            "Slurm cancelled it due to time limit",
+        ),
+        ("error: *** JOB 8 ON n1 CANCELLED AT 2026-01-01T12:00:00 ***\n", "Slurm cancelled it"),
+        ("error: Detected 1 oom_kill event in StepId=8.0.\n", "Slurm killed it, out of memory"),
+        ("At least one job did not complete successfully.\n", "it ended without a word"),
+    ],
+)
+def test_why_slurm_ended_an_entry_and_that_it_is_tried_again(
+    tmp_path: Path, handler: LogHandler, entry: str, word: str
+) -> None:
+    study = Study([A, B], [A[:3], B[:3]], cores=None, retries=1)
+    tell(handler, "2 runs", study=study)
+    file = tmp_path / "8.log"
+    file.write_text(entry)
+    one, two = "train CartPole-v1 ppo 0 failed: ", "2 runs in one entry of the queue failed: "
+    for attempt in range(2):
+        for number, run in enumerate((A, B)):
+            begin(handler, number, *run[:3], log=tmp_path / "none")
+        tell(handler, f"Job {attempt} has been submitted with SLURM jobid 8 (log: {file}).")
+        assert shown(study) == ["0 of 2 runs done, 2 submitted; time left not known yet"]
+        fail(handler, 0, 1, entry=file)
+        tell(handler, "Trying to restart job 5-7-9.")
+    begin(handler, 0, *A[:3], log=tmp_path / "none")
+    fail(handler, 0, entry=file)
+    handler.close()
+    lines = handler.display.console.file.getvalue().splitlines()
+    where = tmp_path / "none" if word == "it ended without a word" else file
+    assert lines[1:-1] == [
+        f"{two}{word} (more in {file}); tried again",
+        f"{two}{word} (more in {file})",
+        f"{one}{word} (more in {where})",
+    ]
+    assert lines[-1].endswith("0 of 2 runs done, 1 interrupted, 1 failed")
+
+
+def test_which_run_of_an_entry_is_why_it_failed(tmp_path: Path, handler: LogHandler) -> None:
+    """Not those that were done, whose turn did not come, or that failed in an earlier attempt."""
+    runs = [A, B, C, FULL]
+    logs = [tmp_path / name for name in ("earlier", "done", "none", "now")]
+    logs[0].write_text("2026-01-01 12:00:00,000 training A failed: long ago\n")
+    os.utime(logs[0], (1, 1))
+    tell(handler, "4 runs", study=Study(runs, [run[:3] for run in runs], cores=None))
+    for number, run in enumerate(runs):
+        begin(handler, number, *run[:3], log=logs[number])
+    logs[1].write_text("2026-01-01 12:00:00,000 training B: done in 7.0 s\n")
+    logs[3].write_text("2026-01-01 12:00:00,000 training full failed: a NaN\n")
+    fail(handler, *range(4), entry=tmp_path / "no entry.log")
+    handler.close()
+    lines = handler.display.console.file.getvalue().splitlines()
+    assert lines[1] == f"training full failed: a NaN (more in {logs[3]})"
+    assert lines[2].endswith("0 of 4 runs done, 3 interrupted, 1 failed")
 
 
 @pytest.mark.slow

@@ -9,11 +9,12 @@ Snakemake finds this package by its name, and profiles/default/config.yaml choos
 the events of the jobs and reads what the runs tell in their folders, on whichever machine they are.
 """
 
+import re
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from logging import LogRecord
 from pathlib import Path
 from statistics import fmean
@@ -27,24 +28,38 @@ from mace_rl.runs.progress import Countdown, Display, Pace, Run, duration, secon
 
 # What Snakemake says of each job, which stays in its log; of errors, the log of the job says why.
 ROUTINE = [LogEvent(name) for name in ("job_info", "job_started", "job_finished", "job_error")]
-ROUTINE += [LogEvent.PROGRESS, LogEvent.RESOURCES_INFO]
-ROUTINE_ENDS = ("Select jobs to execute...", "exit status 1.", "exit status 130.")
+ROUTINE += [LogEvent.PROGRESS, LogEvent.RESOURCES_INFO, LogEvent.GROUP_INFO, LogEvent.GROUP_ERROR]
+ROUTINE_TEXT = re.compile(
+    r"Select jobs to execute\.\.\.$|exit status (1|130)\.$|"
+    # of Slurm's plugin, for every entry of the queue:
+    r"^Job \S+ has been submitted with SLURM jobid|^Trying to restart job |"
+    r"^No SLURM account given|^No account was given|^Unable to guess SLURM account|"
+    r"^Cleaning up SLURM log files"
+)
+SILENT = "it ended without a word"
+DONE = re.compile(r": done in [\d.]+ s$", re.MULTILINE)
 
 
 class Study:
     """The runs of a study, of which some are `due` (their wildcards), and what becomes of them.
 
     `cores` is how many runs this machine carries out at once; None: others do, whatever they can.
+    Snakemake tries `retries` times again what failed.
     """
 
     def __init__(
-        self, runs: Iterable[Run], due: Iterable[tuple[str, str, str]], cores: int | None
+        self,
+        runs: Iterable[Run],
+        due: Iterable[tuple[str, str, str]],
+        cores: int | None,
+        retries: int = 0,
     ) -> None:
         self.runs = {run[:3]: run for run in runs}
         self.waiting = {key: self.runs[key] for key in due}
         self.begun: dict[Run, Pace] = {}  # or handed to a queue
-        self.ended: Counter[str] = Counter()
-        self.cores = cores
+        self.ended: dict[Run, str] = {}  # done, failed or interrupted
+        self.attempts: Counter[Run] = Counter()
+        self.cores, self.retries = cores, retries
         self.finished = {r: seconds for r in self.runs.values() if (seconds := r.seconds())}
         self.starts = [5.0]  # seconds of jobs beside the training; the first is a guess
         self.countdown = Countdown()
@@ -53,11 +68,13 @@ class Study:
     def begins(self, run: Run) -> None:
         """Its job was started or handed to a queue."""
         self.waiting.pop(run[:3], None)
+        self.ended.pop(run, None)
+        self.attempts[run] += 1
         self.begun[run] = Pace(stale=run.read(files.PROGRESS))
 
     def ends(self, run: Run, how: str) -> None:
         """Its job is done, failed or interrupted."""
-        self.ended[how] += 1
+        self.ended[run] = how
         pace = self.begun.pop(run)
         if how == "done" and (seconds := run.seconds()):
             self.finished[run] = seconds
@@ -69,18 +86,20 @@ class Study:
         from rich.console import Group
         from rich.table import Table
 
+        told = {run: run.read(files.PROGRESS) for run in self.begun}
         for run, pace in self.begun.items():
-            pace.add(run.read(files.PROGRESS))
-        running = {run: pace for run, pace in self.begun.items() if pace.readings}
-        waiting = [*(self.begun.keys() - running.keys()), *self.waiting.values()]
+            pace.add(told[run])
+        known = {run: pace for run, pace in self.begun.items() if pace.readings}
+        running = {run: pace for run, pace in known.items() if told[run]}
+        waiting = [*(self.begun.keys() - known.keys()), *self.waiting.values()]
+        heading = self.summary(len(running), len(known) - len(running))
         if not (running or waiting):
-            return f"{self.summary()}; tables and figures follow"
+            return f"{heading}; tables and figures follow"
         cores = self.cores or len(running)
         left, without = seconds_left(self.finished, running, waiting, cores, fmean(self.starts))
         if without != self.without:  # it is the time left of other runs now
             self.countdown, self.without = Countdown(), without
         words = duration(self.countdown.show(left, now))
-        heading = self.summary(len(running))
         heading += f"; about {words} left" if words else "; time left not known yet"
         if words and without:
             heading += f", without {' and '.join(without)}"
@@ -93,12 +112,13 @@ class Study:
             table.add_row(*row.values())
         return Group(heading, table) if running else heading
 
-    def summary(self, running: int = 0) -> str:
-        """How many runs are done and how many are not."""
+    def summary(self, running: int = 0, trained: int = 0) -> str:
+        """How many runs are done and how many are not; `trained` wait for the end of their job."""
         begun = "starting" if self.cores else "submitted"
-        counts = {"running": running, begun: len(self.begun) - running}
-        counts |= {"waiting": len(self.waiting)} | self.ended
-        done = f"{self.ended['done']} of {sum(counts.values())} runs done"
+        counts = {"running": running, "trained": trained}
+        counts |= {begun: len(self.begun) - running - trained}
+        counts |= {"waiting": len(self.waiting)} | Counter(self.ended.values())
+        done = f"{counts.get('done', 0)} of {sum(counts.values())} runs done"
         rest = [f"{n} {what}" for what, n in counts.items() if n and what != "done"]
         return f"[{time.strftime('%H:%M:%S')}] {', '.join([done, *rest])}"
 
@@ -113,6 +133,7 @@ class LogHandler(LogHandlerBase):
         self.display = Display(sys.stdout if self.common_settings.stdout else sys.stderr)
         self.study = Study([], [], None)
         self.jobs: dict[int, Any] = {}
+        self.blamed: dict[int, str | None] = {}  # of jobs that shared an entry of a queue
         self.closed = threading.Event()
         self.refreshing = threading.Thread(target=self.refresh, daemon=True)
 
@@ -133,35 +154,62 @@ class LogHandler(LogHandlerBase):
             self.jobs[record.jobid] = record
             if run := self.run_of(record):
                 self.study.begins(run)
+        elif event == LogEvent.GROUP_ERROR:
+            members = [self.jobs[member["jobid"]] for member in record.job_error_info]
+            self.blame(members, [Path(log) for log in record.aux_logs])
         elif event in (LogEvent.JOB_FINISHED, LogEvent.JOB_ERROR):
             job = self.jobs[record.jobid if event == LogEvent.JOB_ERROR else record.job_id]
-            why = reason(job) if event == LogEvent.JOB_ERROR else None
+            why = None
+            if event == LogEvent.JOB_ERROR:
+                entry = [Path(log) for log in record.log[len(job.log) :]]
+                why = self.blamed.pop(job.jobid) if record.indent else reason(job, entry)
             if run := self.run_of(job):
                 well = "done" if event == LogEvent.JOB_FINISHED else "interrupted"
                 self.study.ends(run, "failed" if why else well)
             if why:
-                self.display.print(why, "red")
+                self.display.print(why + self.again([job]), "red")
         elif hasattr(record, "study"):
             self.study = record.study
             quiet = {choice.name for choice in self.common_settings.quiet or ()}
             if self.study.waiting and not quiet & {"ALL", "PROGRESS", "RULES"}:
                 self.refreshing.start()
-        routine = event in ROUTINE or str(record.msg).endswith(ROUTINE_ENDS)
+        routine = event in ROUTINE or ROUTINE_TEXT.search(str(record.msg))
         if self.common_settings.dryrun or not routine:
             colour = {"WARNING": "yellow", "ERROR": "red"}.get(record.levelname)
             gap = "\n" if event == LogEvent.JOB_INFO else ""
             self.display.print(gap + self.format(record), colour)
+
+    def blame(self, jobs: list[Any], entry: list[Path]) -> None:
+        """Find out which of `jobs` are why their entry of a queue failed, by its log and theirs."""
+        word = slurms_word(entry)
+        self.blamed = {job.jobid: None if word else own_reason(job) for job in jobs}
+        if not any(self.blamed.values()):
+            runs = f"{len(jobs)} runs in one entry of the queue" if jobs[1:] else name(jobs[0])
+            text = f"{runs} failed: {word or SILENT}{more(entry)}{self.again(jobs)}"
+            self.display.print(text, "red")
+
+    def again(self, jobs: list[Any]) -> str:
+        """Whether Snakemake tries them again, in words."""
+        attempts = [self.study.attempts[run] for job in jobs if (run := self.run_of(job))]
+        return "; tried again" if attempts and max(attempts) <= self.study.retries else ""
 
     def run_of(self, job: Any) -> Run | None:
         """The run of the study that a job trains; None if it does something else."""
         return self.study.runs.get(tuple(job.wildcards.values()))
 
     def refresh(self) -> None:
-        """Keep the table up to date."""
+        """Keep the table up to date.
+
+        That takes a look into the folder of each run that was begun. Where there are thousands, in
+        a cluster's queue and on a shared disk, it is done less often: a tenth of the time at most.
+        """
         assert self.lock is not None  # every handler has one
-        while not self.closed.wait(1.0):
+        pause = 1.0
+        while not self.closed.wait(pause):
             with self.lock:
-                self.display.show(self.study.table(time.monotonic()))
+                began = time.monotonic()
+                self.display.show(self.study.table(began))
+                pause = max(1.0, 9 * (time.monotonic() - began))
 
     def close(self) -> None:
         """Leave a line that says what was done."""
@@ -173,13 +221,40 @@ class LogHandler(LogHandlerBase):
         super().close()
 
 
-def reason(job: Any) -> str | None:
-    """Why a job failed, by its log, and where that is; None if it was interrupted."""
+def reason(job: Any, entry: Sequence[Path] = ()) -> str | None:
+    """Why a job failed, by its log or its `entry`'s in a queue; None if it was interrupted."""
     log = Path(job.log[0])
     for line in reversed(log.read_text(errors="replace").splitlines() if log.exists() else []):
         if line.endswith(": interrupted"):
             return None
         if " failed: " in line:
-            return f"{line.split(' ', 2)[2]} (more in {log})"
-    names = " ".join([job.rule_name, *job.wildcards.values()])
-    return f"{names} failed: it ended without a word (more in {log})"
+            return line.split(" ", 2)[2] + more([log])
+    word = slurms_word(entry)
+    return f"{name(job)} failed: {word or SILENT}{more(entry if word else [log])}"
+
+
+def name(job: Any) -> str:
+    """What a job is called."""
+    return " ".join([job.rule_name, *job.wildcards.values()])
+
+
+def own_reason(job: Any) -> str | None:
+    """Why one of several jobs in an entry failed; None if it was done, or its turn never came."""
+    log = Path(job.log[0])
+    if not log.exists() or log.stat().st_mtime < job.created:  # it is of an earlier attempt
+        return None
+    return None if DONE.search(log.read_text(errors="replace")) else reason(job)
+
+
+def slurms_word(entry: Iterable[Path]) -> str | None:
+    """Why Slurm ended an entry of its queue, by the entry's log; None if it did not."""
+    text = "".join(log.read_text(errors="replace") for log in entry if log.exists())
+    if re.search("oom.kill", text, re.IGNORECASE):
+        return "Slurm killed it, out of memory"
+    found = re.search(r"\*\*\* JOB \d+ ON \S+ CANCELLED AT \S+ (.*)\*\*\*", text)
+    return f"Slurm cancelled it {found[1].lower()}".strip() if found else None
+
+
+def more(logs: Iterable[Path]) -> str:
+    """Where there is more."""
+    return "".join(f" (more in {log})" for log in logs)
