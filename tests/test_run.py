@@ -411,6 +411,28 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(
     assert interruption["after_episode"] == 3
 
 
+# --- Finished, deleted with the rest of its job, and asked for again ------------------------------
+
+
+@pytest.mark.parametrize("left", [[], RESULTS[:2], RESULTS])
+def test_deleted_results_come_back_from_the_last_checkpoint(
+    run_config, tmp_path, monkeypatch, left
+):
+    config, directory = run_config("CartPole-v1", "mace_full", 0, episodes=4), tmp_path / "run"
+    run.run(config, directory, keep_checkpoint=True)
+    assert files(directory) == sorted([*RESULTS, "checkpoint.pt"])
+    contents = {name: (directory / name).read_bytes() for name in OUTCOME}
+    for name in RESULTS:
+        (directory / name).unlink()
+    for name in left:  # of a job that was killed while it wrote them
+        (directory / name).write_text("stale")
+    monkeypatch.delattr(Trainer, "improve")
+    run.run(config, directory, keep_checkpoint=True)
+    assert {name: (directory / name).read_bytes() for name in OUTCOME} == contents
+    [interruption] = json.loads((directory / "run.json").read_text())["interruptions"]
+    assert interruption["after_episode"] == 4
+
+
 # --- What a run leaves behind -------------------------------------------------------------------
 
 

@@ -69,6 +69,8 @@ class Project:
         """The command as typed in the project's folder, with the environment activated."""
         search = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         changes = {"PATH": search, "PYTHONPATH": str(self["src"]), "TERM": "xterm"}
+        # As on a node of a cluster, which inherits it from the machine that submitted.
+        changes["MACE_RL_SNAKEMAKE_PID"] = str(2**22 + 1)  # more than Linux has
         environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | changes
         return subprocess.Popen(
             shlex.split(command),
@@ -278,6 +280,18 @@ def test_one_snakemake_at_a_time(finished: Project, edit) -> None:
         refusal = "Error: Snakemake (process 7 on moon) is at work in results; wait for it"
         assert refusal in output.splitlines()
         assert finished.planned() == {"figure": 2}  # looking is allowed
+
+
+def test_success_removes_the_checkpoints_of_finished_runs_alone(finished: Project) -> None:
+    """Those that runs on a cluster left."""
+    done, unfinished = (finished[f"part/runs/CartPole-v1/{name}/seed0"] for name in VARIANTS[:2])
+    for run in (done, unfinished):
+        run.mkdir(parents=True)
+        (run / "checkpoint.pt").touch()
+    (done / "run.json").write_text("{}")
+    code, output = finished("snakemake part/table2.tex --config results=part")
+    assert code == 0, output
+    assert not (done / "checkpoint.pt").exists() and (unfinished / "checkpoint.pt").exists()
 
 
 def test_the_same_command_after_ctrl_c_and_after_a_kill(finished: Project) -> None:

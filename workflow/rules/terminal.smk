@@ -7,8 +7,13 @@ from types import SimpleNamespace
 from snakemake.logging import logger
 from snakemake_logger_plugin_mace_rl import Run, Study
 
-# A job ends when the Snakemake that started it does, even by SIGKILL: workflow/scripts/job.py.
+# A job ends when the Snakemake that started it does, even by SIGKILL: workflow/scripts/job.py. On a
+# cluster that is the Snakemake on the node, which reads this too, and not the one that submitted.
 os.environ.update(MACE_RL_SNAKEMAKE_PID=str(os.getpid()))
+# There several runs share a job. If that ends in the middle, Snakemake deletes the results of those
+# that were done, too, and they come back from their last checkpoints.
+if workflow.remote_exec:
+    os.environ.update(MACE_RL_KEEP_CHECKPOINTS="yes")
 
 
 def occupy(folder):
@@ -45,5 +50,12 @@ onstart:
     # Snakemake tells its loggers how many jobs there will be, but not which.
     jobs = [job for job in workflow.dag.needrun_jobs() if job.rule.name == "train"]
     due = [tuple(job.wildcards_dict.values()) for job in jobs]
-    watched = Study(watched_runs(), due, workflow.cores if workflow.local_exec else None)
+    cores = workflow.cores if workflow.local_exec else None
+    watched = Study(watched_runs(), due, cores, workflow.execution_settings.retries)
     logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra={"study": watched})
+
+
+onsuccess:
+    for folder in {Path(episodes).parent for episodes in EPISODES}:
+        if (folder / files.RECORD).exists():  # not of a run that was not asked for and is unfinished
+            (folder / files.CHECKPOINT).unlink(missing_ok=True)

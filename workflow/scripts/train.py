@@ -1,5 +1,6 @@
 """One training run."""
 
+import os
 from pathlib import Path
 
 from job import job
@@ -9,4 +10,8 @@ with job(f"training {run_of.env}, {run_of.variant}, seed {run_of.seed}", snakema
     from mace_rl.config.run import RunConfig
     from mace_rl.runs.run import run
 
-    run(RunConfig.model_validate(snakemake.params.config), Path(snakemake.output.episodes).parent)
+    run(
+        RunConfig.model_validate(snakemake.params.config),
+        Path(snakemake.output.episodes).parent,
+        keep_checkpoint="MACE_RL_KEEP_CHECKPOINTS" in os.environ,
+    )

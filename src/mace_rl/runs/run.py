@@ -46,15 +46,20 @@ class RunError(RuntimeError):
 
 
 def run(
-    config: RunConfig, directory: Path, observe: Callable[[dict[str, Any]], None] | None = None
+    config: RunConfig,
+    directory: Path,
+    observe: Callable[[dict[str, Any]], None] | None = None,
+    keep_checkpoint: bool = False,
 ) -> None:
     """Train as `config` says and leave its results in `directory`.
 
     Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`.
 
     Continues from its checkpoint if there is one of this very configuration, code and versions;
-    otherwise says so in the log and starts afresh. Uses one thread. Raises `RunError` if another
-    process is at work in `directory`, and `ArithmeticError` if arithmetic is not what was chosen.
+    otherwise says so in the log and starts afresh. With `keep_checkpoint` a last one stays, from
+    which results that are deleted come back without training. Uses one thread. Raises `RunError`
+    if another process is at work in `directory`, and `ArithmeticError` if arithmetic is not what
+    was chosen.
     """
     arithmetic.require()
     torch.set_num_threads(1)
@@ -69,6 +74,16 @@ def run(
         before, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
         clock = Clock(started - before, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
         observe = observe or partial(write_progress, directory)
+
+        def save() -> None:
+            state = {
+                "trainer": trainer.state_dict(),
+                "seconds": clock.elapsed(),
+                "interruptions": interruptions,
+                "machine": provenance.machine(),
+            }
+            checkpoint.save(directory / files.CHECKPOINT, identity, state)
+
         for _ in trainer.run():
             if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
                 clock.start_seconds = time.monotonic() - started
@@ -76,19 +91,13 @@ def run(
                 observe(how_far(trainer, clock))
             if clock.checkpoint_due():
                 with clock.saving():
-                    checkpoint.save(
-                        directory / files.CHECKPOINT,
-                        identity,
-                        {
-                            "trainer": trainer.state_dict(),
-                            "seconds": clock.elapsed(),
-                            "interruptions": interruptions,
-                            "machine": provenance.machine(),
-                        },
-                    )
+                    save()
+        if keep_checkpoint:
+            save()
         write_results(directory, trainer, identity, clock, interruptions)
-        for name in (files.CHECKPOINT, files.PROGRESS):
-            (directory / name).unlink(missing_ok=True)
+        if not keep_checkpoint:
+            (directory / files.CHECKPOINT).unlink(missing_ok=True)
+        (directory / files.PROGRESS).unlink(missing_ok=True)
 
 
 def run_identity(config: RunConfig) -> dict[str, Any]:
