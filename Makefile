@@ -21,7 +21,7 @@ SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick tables numbers bench verify cross-cpu kill-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick tables numbers bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -52,6 +52,9 @@ cross-cpu: setup ## train under emulated processors and compare to the bit (half
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
 	@$(IN_VENV) tools.kill_test
+
+slurm-test: setup ## the reduced study on a Slurm cluster of one node, compared to the bit (minutes)
+	@$(IN_VENV) tools.slurm_test
 
 archive: setup ## the committed tree with checksums as dist/mace-rl-VERSION.tar, for a DOI
 	@$(IN_VENV) tools.deposit

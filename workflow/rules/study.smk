@@ -14,7 +14,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 from mace_rl.config.plugins import source_file
 from mace_rl.results import paper
-from mace_rl.runs import provenance
+from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
 
 # Snakemake pastes this path into the shell commands of `script:` jobs, where a space would split it.
@@ -69,6 +69,16 @@ def most_work(wildcards):
     own_limit = gymnasium.registry[config.environment.rpartition(":")[2]].max_episode_steps
     steps = config.episodes * (config.max_episode_steps or own_limit)
     return steps if config.beta.kind == "none" else 2 * steps
+
+
+def minutes(wildcards):
+    """The time to ask a cluster for."""
+    return queueing.minutes(run_config(wildcards), most_work(wildcards))
+
+
+def queue_entry(wildcards):
+    """The group whose runs share entries of a cluster's queue; None without a cluster's profile."""
+    return queueing.entry(minutes(wildcards), workflow.group_settings.group_components)
 
 
 @cache

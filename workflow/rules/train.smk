@@ -12,10 +12,13 @@ rule train:
     benchmark:
         f"{RESULTS}/benchmarks/train/{{env}}/{{variant}}/seed{{seed}}.tsv"
     priority: most_work
+    group:
+        queue_entry
     threads: 1
+    # A cluster that ends it for want of time or memory gives it more at the next attempt.
     resources:
-        mem_mb=1000,
-        runtime=1440,
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+        runtime=lambda wildcards, attempt: minutes(wildcards) * attempt,
     params:
         config=lambda wildcards: run_config(wildcards).settings(),
         code=lambda wildcards: code("train.py", run_config(wildcards)),
