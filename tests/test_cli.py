@@ -73,6 +73,7 @@ MALFORMED = {
     "unknown engine": ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
     "verify without folder": ["verify"],
     "evaluate without folder": ["evaluate", "--episodes", "3"],
+    "watch without folder": ["watch", "--untrained"],
     "tensorboard without folder": ["tensorboard", "--out", "x"],
 }
 
@@ -158,7 +159,7 @@ def test_the_examples_in_the_help_texts_work(monkeypatch, tmp_path, caplog, caps
         assert (word, program, words[0]) == ("example:", "mace-rl", name or "train")
         assert call(monkeypatch, *words) == (0, ""), words
     assert (tmp_path / "cartpole_run/episodes.csv").exists()
-    assert list((tmp_path / "events").iterdir())
+    assert list((tmp_path / "events").iterdir()) and (tmp_path / "cartpole.gif").exists()
     assert "20 episodes: mean return" in (said := capsys.readouterr().out)
     assert "1 of 1 runs equal to the bit" in said
 
@@ -308,6 +309,21 @@ def test_without_chance_an_agent_takes_its_most_probable_actions(
             expected[-1] += reward
     assert evaluate(tmp_path, 3, 5, deterministic=True) == pytest.approx(expected, rel=1e-3)
     assert evaluate(tmp_path, 3, 5).tolist() != pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--out", "a.mp4"], "--out is 'a.mp4', but should end in .gif or .webp"),
+        (["--seconds", "0"], "--seconds should be greater than 0"),
+        (["--width", "10"], "--width from 50"),
+        (["--episodes", "0"], "--episodes should be at least 1"),
+        ([], "run.json: not readable"),
+    ],
+)
+def test_a_film_that_cannot_be_made_gets_one_line(monkeypatch, tmp_path, options, expected):
+    code, message = call(monkeypatch, "watch", str(tmp_path), *options)
+    assert code == 1 and expected in message and "\n" not in message
 
 
 def test_a_kept_run_is_verified_to_the_bit(reference, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""The command `mace-rl`: train one run, play with its agent, look at runs, repeat kept ones."""
+"""The command `mace-rl`: train one run, play with its agent, film it, repeat kept runs."""
 
 import argparse
 import logging
@@ -60,6 +60,33 @@ def parser() -> argparse.ArgumentParser:
         "--deterministic",
         action="store_true",
         help="take the most probable action, or the mean, instead of a sample",
+    )
+    watch = commands.add_parser(
+        "watch",
+        allow_abbrev=False,
+        help="film a trained agent",
+        description="Write an animation of the first episodes that `mace-rl evaluate` plays.",
+        epilog="example: mace-rl watch cartpole_run --out cartpole.gif",
+    )
+    watch.add_argument("folder", type=Path, help="of a finished run")
+    watch.add_argument("--episodes", type=int, default=1, help="how many (default: 1)")
+    watch.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    watch.add_argument(
+        "--deterministic",
+        action="store_true",
+        help="take the most probable action, or the mean, instead of a sample",
+    )
+    watch.add_argument(
+        "--untrained", action="store_true", help="film the agent as it was before training"
+    )
+    watch.add_argument(
+        "--seconds", type=float, default=10.0, help="of each episode at most (default: 10)"
+    )
+    watch.add_argument("--width", type=int, default=300, help="in pixels (default: 300)")
+    watch.add_argument(
+        "--out",
+        type=Path,
+        help="a .gif or .webp file (default: watch.gif or watch_untrained.gif in the folder)",
     )
     tensorboard = commands.add_parser(
         "tensorboard",
@@ -147,6 +174,33 @@ def evaluate(arguments: argparse.Namespace) -> None:
     )
 
 
+def watch(arguments: argparse.Namespace) -> None:
+    """`mace-rl watch`."""
+    if arguments.episodes < 1 or arguments.seed < 0:
+        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+    if not (arguments.seconds > 0 and 50 <= arguments.width <= 2000):
+        raise ConfigError("--seconds should be greater than 0 and --width from 50 to 2000")
+    name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
+    out: Path = arguments.out or arguments.folder / name
+    if out.suffix not in (".gif", ".webp"):
+        raise ConfigError(f"--out is {str(out)!r}, but should end in .gif or .webp")
+    from mace_rl.runs import watch
+
+    film = watch.film(
+        arguments.folder,
+        arguments.episodes,
+        arguments.seed,
+        deterministic=arguments.deterministic,
+        untrained=arguments.untrained,
+        width=arguments.width,
+        seconds=arguments.seconds,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    files.write_atomically(out, watch.encode(film, out.suffix))
+    returns = ", ".join(f"{value:.2f}" for value in film.returns)
+    logger.info("return %s: %s", returns, out)
+
+
 def tensorboard(arguments: argparse.Namespace) -> None:
     """`mace-rl tensorboard`."""
     from mace_rl.runs import events
@@ -172,7 +226,13 @@ def verify(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
     arguments = parser().parse_args()
-    commands = {"train": train, "evaluate": evaluate, "tensorboard": tensorboard, "verify": verify}
+    commands = {
+        "train": train,
+        "evaluate": evaluate,
+        "watch": watch,
+        "tensorboard": tensorboard,
+        "verify": verify,
+    }
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         commands[arguments.command](arguments)

@@ -1,0 +1,175 @@
+"""Animations of a finished run's agent, drawn by its environment's own renderer."""
+
+import io
+import math
+import os
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mace_rl import files
+from mace_rl.agent.policy import ActingPolicy
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.environments.environment import Environment, nothing_printed
+from mace_rl.environments.rollout import draw_noise, roll_out
+from mace_rl.runs.agent import MostProbable, load_acting
+from mace_rl.runs.provenance import read_record
+from mace_rl.train import Trainer
+
+# pygame needs neither a screen nor a loudspeaker to draw into memory, and should not look for them.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+
+MOST_PER_SECOND = 20  # pictures; what an environment has more of is left out, the speed is its own
+LAST_SECONDS = 1.0  # for which the end of an episode stands still
+COLOURS = 48  # of a GIF
+LINE_HEIGHT = 18  # pixels, below the picture, for the step and the return so far
+
+
+@dataclass(frozen=True)
+class Film:
+    """Pictures with the time that each is shown, and the returns of the episodes in them."""
+
+    pictures: list[Image.Image]
+    milliseconds: list[int]
+    returns: list[float]  # of whole episodes, whatever was left out of the film
+
+
+class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose episodes are filmed, `seconds` of each at most, `width` pixels wide."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], name: str, width: int, seconds: float) -> None:
+        super().__init__(env)
+        self.name, self.width = name, width
+        per_second = env.metadata.get("render_fps") or MOST_PER_SECOND
+        self.stride = math.ceil(per_second / MOST_PER_SECOND)  # steps from picture to picture
+        self.duration = round(1000 * self.stride / per_second)
+        self.last_step = seconds * per_second
+        self.font = ImageFont.load_default(12)
+        self.film = Film([], [], [])
+
+    def reset(self, **arguments: Any) -> Any:
+        """The environment's reset, with the first picture of an episode."""
+        result = super().reset(**arguments)
+        self.steps, self.extrinsic_return = 0, 0.0
+        self._take()
+        return result
+
+    def step(self, action: Any) -> Any:
+        """The environment's step, with a picture every few and at the end."""
+        result = super().step(action)
+        _, reward, terminated, truncated, _ = result
+        self.steps += 1
+        self.extrinsic_return += float(reward)
+        over = terminated or truncated
+        if self.steps <= self.last_step and (over or self.steps % self.stride == 0):
+            self._take()
+        if over:
+            self.film.milliseconds[-1] += round(1000 * LAST_SECONDS)
+            self.film.returns.append(self.extrinsic_return)
+        return result
+
+    def _take(self) -> None:
+        try:
+            drawn = Image.fromarray(np.asarray(self.env.render(), np.uint8))
+        except Exception as error:  # renderers fail by many types: no display, no library, a bug
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ConfigError(f"environment {self.name!r} cannot be drawn: {reason}") from error
+        height = round(drawn.height * self.width / drawn.width)
+        picture = Image.new("RGB", (self.width, height + LINE_HEIGHT), "white")
+        picture.paste(drawn.convert("RGB").resize((self.width, height), Image.Resampling.BOX))
+        text = f"step {self.steps}   return {self.extrinsic_return:.1f}"
+        ImageDraw.Draw(picture).text((4, height + 2), text, fill="black", font=self.font)
+        self.film.pictures.append(picture)
+        self.film.milliseconds.append(self.duration)
+
+
+def film(
+    directory: Path,
+    episodes: int = 1,
+    seed: int = 0,
+    *,
+    deterministic: bool = False,
+    untrained: bool = False,
+    width: int = 300,
+    seconds: float = 10.0,
+) -> Film:
+    """The first `episodes` that `evaluate` plays with the agent in `directory`, or `untrained`.
+
+    The untrained agent is the same one before training: its initial weights, by the run's seed.
+    Raises what `read_agent` raises, and `ConfigError` if the environment cannot be drawn.
+    """
+    config = check(
+        RunConfig, read_record(directory / files.RECORD)["config"], str(directory / files.RECORD)
+    )
+    acting = (
+        _untrained(config, deterministic) if untrained else load_acting(directory, deterministic)
+    )
+    environment, policy = acting
+    # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
+    environment.env.close()
+    if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):
+        raise ConfigError(
+            f"environment {config.environment!r} cannot be drawn: 'rgb_array' is not among its"
+            " render modes"
+        )
+    environment = Environment(
+        config.environment,
+        np.random.SeedSequence(0),
+        config.max_episode_steps,
+        {**config.environment_arguments, "render_mode": "rgb_array"},
+    )
+    filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
+    generator = np.random.default_rng(seed)
+    with closing(filmed), nothing_printed():
+        filmed.unwrapped.reset(seed=seed)
+        for _ in range(episodes):
+            roll_out(environment, policy, draw_noise(environment, generator))
+    return filmed.film
+
+
+def encode(shown: Film, suffix: str) -> bytes:
+    """A film as a file that plays without end; suffix: ".gif" or ".webp"."""
+    first, *others = shown.pictures
+    options: dict[str, Any] = {}
+    if suffix == ".gif":  # one palette, from pictures all over the film, and no dithering: small
+        sample = shown.pictures[:: math.ceil(len(shown.pictures) / 16)]
+        wall = Image.new("RGB", (first.width, first.height * len(sample)))
+        for place, picture in enumerate(sample):
+            wall.paste(picture, (0, place * first.height))
+        palette = wall.quantize(COLOURS, Image.Quantize.FASTOCTREE)  # keeps white white
+        first, *others = (
+            picture.quantize(palette=palette, dither=Image.Dither.NONE)
+            for picture in shown.pictures
+        )
+    else:
+        options = {"quality": 60, "method": 4}
+    file = io.BytesIO()
+    first.save(
+        file,
+        format=suffix.removeprefix("."),
+        save_all=True,
+        append_images=others,
+        duration=shown.milliseconds,
+        loop=0,
+        **options,
+    )
+    return file.getvalue()
+
+
+def _untrained(config: RunConfig, deterministic: bool) -> tuple[Environment, ActingPolicy]:
+    """What `load_acting` gives, with the policy that the run began with."""
+    trainer = Trainer(config)
+    if not deterministic:
+        return trainer.environment, trainer.ppo.acting_policy()
+    mean, std, clip = trainer.ppo.normalisation()
+    unit = (1.0 / std).astype(np.float32)
+    return trainer.environment, MostProbable(
+        trainer.ppo.policy, mean.astype(np.float32), unit, np.float32(clip)
+    )

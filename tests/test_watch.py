@@ -1,0 +1,115 @@
+"""Animations of agents: what is filmed is what was played, and how it is written."""
+
+import gc
+import io
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.classic_control import CartPoleEnv
+from PIL import Image
+
+from mace_rl import files
+from mace_rl.config.section import ConfigError
+from mace_rl.runs import watch
+from mace_rl.runs.agent import Agent
+from mace_rl.runs.checkpoint import CheckpointError
+from mace_rl.runs.evaluate import evaluate
+from mace_rl.runs.run import run
+from mace_rl.train import Trainer
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def finished(run_config, tmp_path_factory):
+    """`finished(environment)`: the folder of a run of two episodes."""
+    folder = tmp_path_factory.mktemp("runs")
+
+    def make(environment: str) -> Path:
+        if not (folder / environment).exists():
+            run(run_config(environment, episodes=2), folder / environment)
+        return folder / environment
+
+    return make
+
+
+class NoDisplay(CartPoleEnv):
+    """A renderer that fails."""
+
+    def render(self):
+        raise OSError("no display")
+
+
+@pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0"])
+def test_what_is_filmed_is_what_evaluate_plays(finished, environment):
+    folder = finished(environment)
+    threshold = gc.get_threshold()
+    gc.set_threshold(10)  # what is no longer used goes while the film is made
+    try:
+        for deterministic in (False, True):
+            film = watch.film(folder, 2, 5, deterministic=deterministic)
+            assert film.returns == evaluate(folder, 2, 5, deterministic).tolist()
+    finally:
+        gc.set_threshold(*threshold)
+    assert len(film.pictures) == len(film.milliseconds) > 2
+    assert all(picture.width == 300 for picture in film.pictures)
+    assert len({picture.tobytes() for picture in film.pictures}) > len(film.pictures) / 2
+
+
+def test_the_untrained_agent_has_the_weights_that_training_began_with(finished, run_config):
+    config = run_config(episodes=2)
+    policy, env = Agent(Trainer(config).ppo).policy, gymnasium.make("CartPole-v1")
+    env.reset(seed=5)
+    observation, _ = env.reset()
+    total, ends = 0.0, [False]
+    while not any(ends):
+        with torch.no_grad():
+            action = int(policy(torch.from_numpy(observation)).probs.argmax())
+        observation, reward, *ends, _ = env.step(action)
+        total += float(reward)
+    film = watch.film(finished("CartPole-v1"), 1, 5, deterministic=True, untrained=True)
+    assert film.returns == [total]
+
+
+def test_pictures_and_speed_are_the_environments_own(finished):
+    """CartPole's 50 pictures a second are thinned to 17, and a film is cut where it should be."""
+    folder = finished("CartPole-v1")
+    film = watch.film(folder, seconds=0.2, width=600)
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    env.reset(seed=0)
+    env.reset()
+    shown = np.asarray(film.pictures[0].crop((0, 0, 600, 400)))
+    assert np.array_equal(shown, env.render())
+    assert len(film.pictures) == 1 + 10 // 3  # after steps 0, 3, 6 and 9
+    assert film.milliseconds == [60, 60, 60, 60 + 1000]
+    assert film.returns == evaluate(folder, 1, 0).tolist()
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_film_is_written_whole(finished, suffix):
+    film = watch.film(finished("CartPole-v1"), width=120)
+    data = watch.encode(film, suffix)
+    assert data == watch.encode(film, suffix)
+    with Image.open(io.BytesIO(data)) as image:
+        assert image.format == suffix[1:].upper() and image.info["loop"] == 0
+        assert image.n_frames == len(film.pictures)
+        for place, picture in enumerate(film.pictures):
+            image.seek(place)
+            difference = np.subtract(image.convert("RGB"), picture, dtype=np.int16)
+            assert abs(difference).mean() < 3
+
+
+def test_what_cannot_be_filmed_is_said(finished, tmp_path, register):
+    with pytest.raises(ConfigError, match="'PlantedHelp-v0' cannot be drawn: 'rgb_array' is not"):
+        watch.film(finished("PlantedHelp-v0"))
+    name = register("NoDisplay-v0", NoDisplay)
+    with pytest.raises(ConfigError, match="'NoDisplay-v0' cannot be drawn: OSError: no display"):
+        watch.film(finished(name))
+    for name in (files.RECORD, files.EPISODES):
+        (tmp_path / name).write_bytes((finished("CartPole-v1") / name).read_bytes())
+    with pytest.raises(CheckpointError, match=r"agent\.pt: missing"):
+        watch.film(tmp_path)
+    assert watch.film(tmp_path, untrained=True).pictures  # needs no weights but the first
