@@ -21,7 +21,7 @@ SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick tables numbers bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick tables numbers report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -40,6 +40,9 @@ tables: setup ## every table, figure and verdict from the runs in reference/, wi
 
 numbers: setup ## write what the tables of reference/ say into README and docs
 	@$(IN_VENV) tools.numbers
+
+report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=baseline)
+	@$(IN_VENV) tools.tables --report $(or $(STUDY),baseline)
 
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)

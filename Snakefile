@@ -2,6 +2,7 @@
 
     snakemake -j2 all                                      the paper's budgets (hours)
     snakemake -j2 all --configfile config/reduced.yaml     the same at small budgets (minutes)
+    snakemake -j2 page                                     all of it on one page
 
 Defaults of the command line are in profiles/default/config.yaml.
 """
@@ -26,6 +27,7 @@ localrules:
     figure,
     pictures,
     readings,
+    page,
 
 
 rule all:
@@ -58,4 +60,5 @@ include: "workflow/rules/metrics.smk"
 include: "workflow/rules/tables.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/claims.smk"
+include: "workflow/rules/report.smk"
 include: "workflow/rules/terminal.smk"

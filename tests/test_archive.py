@@ -14,17 +14,21 @@ from tools import archive
 def make_run(folder: Path, text: str) -> None:
     folder.mkdir(parents=True)
     (folder / files.EPISODES).write_text(text)
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    record = {key: {} for key in KEYS} | {"outputs": {files.EPISODES: digest}}
+    (folder / files.AGENT).write_text(f"agent of {text}")
+    digests = {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        for name in (files.EPISODES, files.AGENT)
+    }
+    record = {key: {} for key in KEYS} | {"outputs": digests}
     (folder / files.RECORD).write_text(json.dumps(record))
-    (folder / files.AGENT).write_bytes(b"not kept")
 
 
 def content(folder: Path) -> dict[str, bytes]:
+    """The files in a folder but for agents that are not kept."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != files.AGENT
+        if path.is_file() and (path.name != files.AGENT or path.parent.name == "seed0")
     }
 
 
@@ -37,6 +41,7 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     assert sorted(content(kept)) == ["A-v1/ppo.tar.xz", "B-v0/mace_full.tar.xz"]
     assert archive.unpack(kept, tmp_path / "again") == 4
     assert content(tmp_path / "again") == content(results)
+    assert len([*(tmp_path / "again").rglob(files.AGENT)]) == 1
 
 
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
@@ -54,4 +59,8 @@ def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
     make_run(run, "1\n")
     (run / files.EPISODES).write_text("2\n")
     with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
+        archive.pack(tmp_path / "results", tmp_path / "kept")
+    (run / files.EPISODES).write_text("1\n")
+    (run / files.AGENT).write_text("another")
+    with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
         archive.pack(tmp_path / "results", tmp_path / "kept")

@@ -314,7 +314,7 @@ def test_without_chance_an_agent_takes_its_most_probable_actions(
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--out", "a.mp4"], "--out is 'a.mp4', but should end in .gif or .webp"),
+        (["--out", "a.mp4"], "--out is 'a.mp4', but should end in .gif"),
         (["--seconds", "0"], "--seconds should be greater than 0"),
         (["--width", "10"], "--width from 50"),
         (["--episodes", "0"], "--episodes should be at least 1"),

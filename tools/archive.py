@@ -4,8 +4,9 @@
     .venv/bin/python -m tools.archive unpack ARCHIVE RESULTS
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
-what is not kept. ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to
-those that are there; equal runs give equal files.
+what is not kept; of seed0 the agent too, which the report shows at play.
+ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to those that are there;
+equal runs give equal files.
 """
 
 import io
@@ -18,7 +19,7 @@ from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.runs.provenance import file_digest, read_record
 
-KEPT = (files.EPISODES, files.RECORD)
+AT_PLAY = "seed0"
 
 
 def read(archive: Path) -> dict[str, bytes]:
@@ -53,12 +54,15 @@ def pack(results: Path, archives: Path) -> int:
             if not (run / files.RECORD).exists():
                 continue  # not finished
             digests = read_record(run / files.RECORD)["outputs"]
-            if file_digest(run / files.EPISODES) != digests[files.EPISODES]:
-                raise ValueError(f"{run / files.EPISODES}: not the file that run.json describes")
-            content |= {f"{run.name}/{name}": (run / name).read_bytes() for name in KEPT}
+            kept = [files.EPISODES, *([files.AGENT] if run.name == AT_PLAY else [])]
+            for name in kept:
+                if file_digest(run / name) != digests[name]:
+                    raise ValueError(f"{run / name}: not the file that run.json describes")
+            for name in (*kept, files.RECORD):
+                content[f"{run.name}/{name}"] = (run / name).read_bytes()
         if content:
             write(archive, content)
-        count += len(content) // len(KEPT)
+        count += sum(name.endswith(files.RECORD) for name in content)
     return count
 
 
@@ -71,7 +75,7 @@ def unpack(archives: Path, results: Path) -> int:
         for name, data in content.items():
             (variant / name).parent.mkdir(parents=True, exist_ok=True)
             write_atomically(variant / name, data)
-        count += len(content) // len(KEPT)
+        count += sum(name.endswith(files.RECORD) for name in content)
     return count
 
 

@@ -1,10 +1,12 @@
 """Every table, figure and verdict from the runs that are kept, without training.
 
     python -m tools.tables [--check]        (make tables)
+    python -m tools.tables --report STUDY   (make report)
 
 The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
 the outputs that reference/studies.yaml names. They are compared with those in reference/tables.
-New ones are kept there; with --check that one is missing is a mistake too.
+New ones are kept there; with --check that one is missing is a mistake too. With --report only the
+page of one study is made, and not compared.
 """
 
 import argparse
@@ -22,15 +24,16 @@ from tools import archive
 ROOT = Path(__file__).resolve().parent.parent
 KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
+PAGE = "report.html"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
     *("metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure", "claims"),
-    *("pictures", "readings"),
+    *("pictures", "readings", "page"),
 )
 
 
 def make(name: str, study: dict[str, Any]) -> None:
-    """Make the outputs of one study; exits with what Snakemake says if it cannot."""
+    """Make the `outputs` of one study; exits with what Snakemake says if it cannot."""
     folder = MADE / name
     folder.mkdir(parents=True)
     (folder / "runs").symlink_to("../runs", target_is_directory=True)
@@ -63,11 +66,19 @@ def main() -> None:
         description=__doc__.splitlines()[0], epilog="example: python -m tools.tables --check"
     )
     parser.add_argument("--check", action="store_true", help="keep nothing new")
-    check = parser.parse_args().check
+    parser.add_argument("--report", metavar="STUDY", help="make only this study's page")
+    arguments = parser.parse_args()
+    check, only = arguments.check, arguments.report
     os.chdir(ROOT)
-    shutil.rmtree(MADE, ignore_errors=True)
     studies = read_yaml(STUDIES)
+    if only and only not in studies:
+        sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
+    shutil.rmtree(MADE, ignore_errors=True)
     runs = archive.unpack(KEPT, MADE)
+    if only:
+        make(only, {**studies[only], "outputs": [PAGE]})
+        print(MADE / only / PAGE)
+        return
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(make, studies, studies.values()))
     outputs = {name: study["outputs"] for name, study in studies.items()}

@@ -64,8 +64,8 @@ def parser() -> argparse.ArgumentParser:
     watch = commands.add_parser(
         "watch",
         allow_abbrev=False,
-        help="film a trained agent",
-        description="Write an animation of the first episodes that `mace-rl evaluate` plays.",
+        help="film a trained agent, as a GIF",
+        description="Write an animated GIF of the first episodes that `mace-rl evaluate` plays.",
         epilog="example: mace-rl watch cartpole_run --out cartpole.gif",
     )
     watch.add_argument("folder", type=Path, help="of a finished run")
@@ -86,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
     watch.add_argument(
         "--out",
         type=Path,
-        help="a .gif or .webp file (default: watch.gif or watch_untrained.gif in the folder)",
+        help="a GIF file (default: watch.gif or watch_untrained.gif in the folder)",
     )
     tensorboard = commands.add_parser(
         "tensorboard",
@@ -182,8 +182,8 @@ def watch(arguments: argparse.Namespace) -> None:
         raise ConfigError("--seconds should be greater than 0 and --width from 50 to 2000")
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
     out: Path = arguments.out or arguments.folder / name
-    if out.suffix not in (".gif", ".webp"):
-        raise ConfigError(f"--out is {str(out)!r}, but should end in .gif or .webp")
+    if out.suffix != ".gif":
+        raise ConfigError(f"--out is {str(out)!r}, but should end in .gif")
     from mace_rl.runs import watch
 
     film = watch.film(
@@ -196,7 +196,7 @@ def watch(arguments: argparse.Namespace) -> None:
         seconds=arguments.seconds,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_atomically(out, watch.encode(film, out.suffix))
+    files.write_atomically(out, watch.gif(film))
     returns = ", ".join(f"{value:.2f}" for value in film.returns)
     logger.info("return %s: %s", returns, out)
 

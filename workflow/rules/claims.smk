@@ -5,7 +5,7 @@ rule claims:
     input:
         metrics=f"{RESULTS}/metrics.csv",
         episodes=EPISODES,
-        records=[path.replace(files.EPISODES, files.RECORD) for path in EPISODES],
+        records=RECORDS,
     output:
         json=f"{RESULTS}/claims.json",
         markdown=report(f"{RESULTS}/claims.md", caption="../report/claims.rst", category="Results"),
@@ -14,8 +14,7 @@ rule claims:
     params:
         runs=BUDGETS,
         settings=MEASURED.model_dump(),
-        command="snakemake all"
-        + (f" --configfile {' '.join(paths[:-1])}" if len(paths) > 1 else ""),
+        command=COMMAND,
         code=code("claims.py", MEASURED),
     script:
         "../scripts/claims.py"

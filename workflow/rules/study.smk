@@ -22,7 +22,8 @@ sys.executable = shlex.quote(sys.executable)
 
 try:
     paths = [os.path.relpath(file) for file in workflow.configfiles]
-    origin = " + ".join(paths[-1:] + paths[:-1])  # Snakemake lists its own config.yaml last
+    config_files = paths[-1:] + paths[:-1]  # Snakemake lists its own config.yaml last
+    origin = " + ".join(config_files)
     for file in paths:
         read_yaml(Path(file))  # sees what Snakemake's reader does not: a key that occurs twice
     # Snakemake takes the numbers in `--config seeds=[0,1]` for text.
@@ -35,6 +36,7 @@ RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
+RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
 # The claim ledger is for a study that has all the paper makes claims of.
 TESTS_CLAIMS = (
     set(paper.ENVIRONMENTS) <= set(study.environments)
@@ -44,6 +46,8 @@ TESTS_CLAIMS = (
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
 # Pictures of every run at once; one of the regret only where the configuration asks for it.
 PICTURES = ["every_seed", "profiles", *(["regret"] if study.metrics.regret else [])]
+# How the study is carried out, for what tells where it comes from.
+COMMAND = " ".join(["snakemake all", *(["--configfile", *config_files[1:]] if paths[1:] else [])])
 BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
 
 
@@ -97,3 +101,25 @@ def code(script, settings=None):
     """
     named = settings.references() if settings else {}
     return digest_of(script, *(source_file(reference, key) for key, reference in named.items()))
+
+
+@cache
+def what_needs_what():
+    """For each rule the rules whose output it reads; asked for when all of them are known."""
+    steps = [step for step in workflow.rules if step.name != "all"]
+    # One file of each name will do: a thousand runs have a thousand files of the same kind.
+    read = {step.name: {os.path.basename(file): file for file in step.input} for step in steps}
+    return {
+        step.name: [
+            maker.name
+            for maker in steps
+            if any(makes(maker, str(file)) for file in read[step.name].values())
+        ]
+        for step in steps
+    }
+
+
+def makes(step, file):
+    """Whether `file`, which may have wildcards, is an output of the step."""
+    patterns = [re.sub(r"\{(\w+),[^{}]*\}", r"{\1}", str(output)) for output in step.output]
+    return file in patterns or step.is_producer(file)

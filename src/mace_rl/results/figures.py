@@ -4,6 +4,7 @@ Figure 1 is the paper's, the extrinsic return; Figure 2 shows β. A picture is d
 alone, and the same data gives the same file, byte for byte.
 """
 
+import io
 import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -189,12 +190,25 @@ def save_figure(figure: "Figure", path: str | Path) -> None:
         figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dict.fromkeys(fields))
 
 
+def figure_as_svg(figure: "Figure") -> str:
+    """A figure of this module as an SVG file without background, its text as text.
+
+    An equal figure gives an equal file here too.
+    """
+    file = io.StringIO()
+    fields = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with style():
+        figure.savefig(file, format="svg", transparent=True, metadata=fields)
+    return file.getvalue()
+
+
 def style() -> AbstractContextManager[None]:
     """The settings to draw and to save with: text is laid out on saving."""
     import matplotlib
     import seaborn
 
     fonts = {"font.family": "DejaVu Sans", "pdf.fonttype": 42}  # this font comes with matplotlib
+    fonts |= {"svg.fonttype": "none", "svg.hashsalt": "mace_rl"}  # text as text; ids that stay
     return matplotlib.rc_context(
         seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
         | seaborn.plotting_context("paper", font_scale=0.9)

@@ -28,8 +28,12 @@ os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
 MOST_PER_SECOND = 20  # pictures; what an environment has more of is left out, the speed is its own
 LAST_SECONDS = 1.0  # for which the end of an episode stands still
-COLOURS = 48  # of a GIF
+COLOURS = 48
 LINE_HEIGHT = 18  # pixels, below the picture, for the step and the return so far
+
+
+class RenderError(ConfigError):
+    """An environment that cannot be drawn; the message names it and says why."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
             drawn = Image.fromarray(np.asarray(self.env.render(), np.uint8))
         except Exception as error:  # renderers fail by many types: no display, no library, a bug
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ConfigError(f"environment {self.name!r} cannot be drawn: {reason}") from error
+            raise RenderError(f"environment {self.name!r} cannot be drawn: {reason}") from error
         height = round(drawn.height * self.width / drawn.width)
         picture = Image.new("RGB", (self.width, height + LINE_HEIGHT), "white")
         picture.paste(drawn.convert("RGB").resize((self.width, height), Image.Resampling.BOX))
@@ -103,7 +107,7 @@ def film(
     """The first `episodes` that `evaluate` plays with the agent in `directory`, or `untrained`.
 
     The untrained agent is the same one before training: its initial weights, by the run's seed.
-    Raises what `read_agent` raises, and `ConfigError` if the environment cannot be drawn.
+    Raises what `read_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
     config = check(
         RunConfig, read_record(directory / files.RECORD)["config"], str(directory / files.RECORD)
@@ -115,7 +119,7 @@ def film(
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):
-        raise ConfigError(
+        raise RenderError(
             f"environment {config.environment!r} cannot be drawn: 'rgb_array' is not among its"
             " render modes"
         )
@@ -134,31 +138,26 @@ def film(
     return filmed.film
 
 
-def encode(shown: Film, suffix: str) -> bytes:
-    """A film as a file that plays without end; suffix: ".gif" or ".webp"."""
-    first, *others = shown.pictures
-    options: dict[str, Any] = {}
-    if suffix == ".gif":  # one palette, from pictures all over the film, and no dithering: small
-        sample = shown.pictures[:: math.ceil(len(shown.pictures) / 16)]
-        wall = Image.new("RGB", (first.width, first.height * len(sample)))
-        for place, picture in enumerate(sample):
-            wall.paste(picture, (0, place * first.height))
-        palette = wall.quantize(COLOURS, Image.Quantize.FASTOCTREE)  # keeps white white
-        first, *others = (
-            picture.quantize(palette=palette, dither=Image.Dither.NONE)
-            for picture in shown.pictures
-        )
-    else:
-        options = {"quality": 60, "method": 4}
+def gif(shown: Film) -> bytes:
+    """A film as an animated GIF that plays without end."""
+    # One palette, from pictures all over the film, and no dithering keep it small.
+    sample = shown.pictures[:: math.ceil(len(shown.pictures) / 16)]
+    width, height = sample[0].size
+    wall = Image.new("RGB", (width, height * len(sample)))
+    for place, picture in enumerate(sample):
+        wall.paste(picture, (0, place * height))
+    palette = wall.quantize(COLOURS, Image.Quantize.FASTOCTREE)  # keeps white white
+    first, *others = (
+        picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in shown.pictures
+    )
     file = io.BytesIO()
     first.save(
         file,
-        format=suffix.removeprefix("."),
+        format="GIF",
         save_all=True,
         append_images=others,
         duration=shown.milliseconds,
         loop=0,
-        **options,
     )
     return file.getvalue()
 

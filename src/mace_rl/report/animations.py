@@ -1,0 +1,96 @@
+"""Agents at play before and after training, for the page."""
+
+import base64
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mace_rl import files
+from mace_rl.runs.watch import Film, RenderError, film, gif
+
+WIDTH, SECONDS = 200, 5.0  # a film of Hopper's then takes less than 400 kB
+
+
+@dataclass(frozen=True)
+class Animation:
+    """One film as it stands on the page, its pictures as data URIs."""
+
+    title: str
+    extrinsic_return: float  # of the whole episode
+    moving: str
+    still: str  # the last picture, for who prefers no motion
+    variants: tuple[str, ...]
+    trained: bool
+
+
+@dataclass
+class Animations:
+    """What there is to show of each environment, and why there is not more."""
+
+    shown: dict[str, list[Animation]] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)  # sentences
+
+
+def animations(
+    runs: Mapping[tuple[str, str], Path], labels: Mapping[str, str], origin: Path
+) -> Animations:
+    """Films of one run of each environment and variant, untrained and trained.
+
+    `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
+    agents do the same share that film. An agent that is not there and an environment that cannot be
+    drawn are said; an agent that is not the one of its `run.json` is an error.
+    """
+    found = Animations()
+    for environment in dict.fromkeys(environment for environment, _ in runs):
+        folders = {variant: runs[env, variant] for env, variant in runs if env == environment}
+        try:
+            shown = _of_one(folders, labels, found.missing, origin)
+        except RenderError as error:
+            found.missing.append(f"{error}.")
+            continue
+        if shown:
+            found.shown[environment] = shown
+    return found
+
+
+def _of_one(
+    folders: Mapping[str, Path], labels: Mapping[str, str], missing: list[str], origin: Path
+) -> list[Animation]:
+    """Of one environment: untrained agents first, then the trained ones."""
+    untrained: dict[bytes, tuple[Film, list[str]]] = {}
+    trained = []
+    for variant, folder in folders.items():
+        if not (folder / files.AGENT).exists():
+            name = folder.relative_to(origin) if folder.is_relative_to(origin) else folder
+            missing.append(f"{name} has no {files.AGENT}, so its agent cannot be shown.")
+            continue
+        before = film(folder, untrained=True, width=WIDTH, seconds=SECONDS)
+        untrained.setdefault(gif(before), (before, []))[1].append(variant)
+        after = film(folder, width=WIDTH, seconds=SECONDS)
+        trained.append(_animation(labels[variant], after, gif(after), [variant], True))
+    first = []
+    for data, (shown, variants) in untrained.items():
+        whose = "" if len(untrained) == 1 else ": " + ", ".join(labels[name] for name in variants)
+        first.append(_animation(f"Before training{whose}", shown, data, variants, False))
+    return [*first, *trained]
+
+
+def _animation(
+    title: str, shown: Film, data: bytes, variants: list[str], trained: bool
+) -> Animation:
+    still = io.BytesIO()
+    shown.pictures[-1].quantize(32).save(still, format="PNG", optimize=True)
+    return Animation(
+        title,
+        shown.returns[0],
+        data_uri("image/gif", data),
+        data_uri("image/png", still.getvalue()),
+        tuple(variants),
+        trained,
+    )
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """Data that stands in the page itself."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

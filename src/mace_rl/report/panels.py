@@ -1,0 +1,62 @@
+"""A figure for the page: its panels one by one, as SVG that takes the page's colours."""
+
+import math
+import re
+from collections.abc import Mapping
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from mace_rl.config.results import FigureConfig, MetricsConfig
+from mace_rl.results.figures import Quantity, draw_figure, figure_as_svg
+
+WIDTH, HEIGHT = 3.3, 2.5  # inches: letters of a readable size on a phone
+MAX_POINTS = 250  # per curve: a point for every pixel and a half
+
+
+def panels(
+    curves: pd.DataFrame,
+    single_seeds: pd.DataFrame,
+    shown: Quantity,
+    settings: MetricsConfig,
+    labels: Mapping[str, str],
+    colours: Mapping[str, str],
+) -> dict[str, str]:
+    """The panel of each environment, as `draw_figure` draws it from the same data.
+
+    The legend is left out. Fewer points are drawn than in the figure's files, the last one always.
+    """
+    drawn: dict[str, str] = {}
+    for environment, own in curves.groupby("env", sort=False):
+        seeds = single_seeds[single_seeds["env"] == environment]
+        figure = draw_figure(
+            _thinned(own),
+            _thinned(seeds),
+            shown,
+            FigureConfig(columns=1),
+            settings.confidence,
+            labels,
+            colours,
+        )
+        for legend in figure.legends:
+            legend.remove()
+        figure.set_size_inches(WIDTH, HEIGHT)
+        drawn[str(environment)] = _svg(figure, f"{shown.name}-{len(drawn)}", str(environment))
+    return drawn
+
+
+def _thinned(frame: pd.DataFrame) -> pd.DataFrame:
+    episodes = sorted(frame["episode"].unique())
+    kept = episodes[:: -math.ceil(len(episodes) / MAX_POINTS)]
+    return frame[frame["episode"].isin(kept)]
+
+
+def _svg(figure: Figure, name: str, label: str) -> str:
+    """A figure as an SVG element whose ids begin with `name`."""
+    text = figure_as_svg(figure)
+    text = text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    text = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", text)
+    # A tenth of a point is a seventh of a pixel; long decimals are half the file.
+    text = re.sub(r"(-?\d+\.\d)\d+", r"\1", text)
+    # What seaborn draws almost black is drawn in the colour of the page's text.
+    return text.replace("#262626", "currentColor").replace("#000000", "currentColor")

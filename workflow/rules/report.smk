@@ -1,0 +1,49 @@
+# One page of everything to read. Snakemake's own (`--report`) has the outputs one by one, with every
+# job's code and times, in an application that needs scripts; verdicts and agents at play it has not.
+
+from mace_rl.sources import PACKAGE
+
+REPORTED = {
+    "metrics": f"{RESULTS}/metrics.csv",
+    "table1": f"{RESULTS}/table1.csv",
+    "supplement": f"{RESULTS}/supplement.csv",
+    "comparisons": f"{RESULTS}/comparisons.csv",
+    "aggregate": f"{RESULTS}/aggregate.csv",
+    **{f"curves{number}": f"{RESULTS}/figure{number}.csv" for number in "12"},
+    **{f"seeds{number}": f"{RESULTS}/figure{number}_seeds.csv" for number in "12"},
+    "records": RECORDS,
+    # To these the page refers.
+    "in_print": [f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
+}
+if MEASURED.regret:
+    REPORTED["regret"] = f"{RESULTS}/regret.csv"
+if CLAIMS:
+    REPORTED["claims"] = CLAIMS[0]
+
+
+# The agents that are shown are no inputs: where runs are kept without them, the page says so. Each
+# run.json, which is an input, has its agent's digest.
+rule page:
+    input:
+        **REPORTED,
+    output:
+        f"{RESULTS}/report.html",
+    log:
+        f"{RESULTS}/logs/report.log",
+    params:
+        runs=BUDGETS,
+        settings=MEASURED.model_dump(),
+        labels=study.labels,
+        colours=study.colours,
+        command=COMMAND,
+        configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
+        given={key: value for key, value in given.items() if key != "results"},
+        ppo={
+            env: study.run_config(env, study.variants[0], 0).ppo.model_dump()
+            for env in study.environments
+        },
+        needs=lambda wildcards: what_needs_what(),
+        template=provenance.file_digest(PACKAGE / "report" / "page.html"),
+        code=code("report.py", MEASURED),
+    script:
+        "../scripts/report.py"
