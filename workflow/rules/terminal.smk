@@ -57,5 +57,7 @@ onstart:
 
 onsuccess:
     for folder in {Path(episodes).parent for episodes in EPISODES}:
-        if (folder / files.RECORD).exists():  # not of a run that was not asked for and is unfinished
+        if (
+            folder / files.RECORD
+        ).exists():  # not of a run that was not asked for and is unfinished
             (folder / files.CHECKPOINT).unlink(missing_ok=True)
