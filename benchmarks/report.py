@@ -10,7 +10,7 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from benchmarks import wrapper
+from benchmarks import start, wrapper
 from benchmarks.breakdown import ALL_SECTIONS
 from benchmarks.settings import (
     ACROBOT,
@@ -48,9 +48,9 @@ RATIOS = (
 
 def measure_all(scale: Scale) -> None:
     """Write the document and the pictures of the data in `scale.data`, and summary.csv."""
-    names = ("results", "breakdown", "growth", "workflow", "planning", "wrapper")
+    names = ("results", "breakdown", "growth", "workflow", "planning", "start", "wrapper")
     data = [pd.read_csv(scale.data / f"{name}.csv") for name in names]
-    results, times, growth, jobs, planning, costs = data
+    results, times, growth, jobs, planning, starts, costs = data
     summary = speed_summary(results)
     summary.to_csv(scale.data / "summary.csv", index=False)
     draw_speed(summary, scale)
@@ -66,6 +66,7 @@ def measure_all(scale: Scale) -> None:
         "breakdown": breakdown_table(times),
         "growth": growth_table(growth),
         "workflow": workflow_table(study, plan),
+        "start": start_table(starts),
         "wrapper": wrapper.table(costs),
     }
     text = filled((ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), tables)
@@ -304,6 +305,28 @@ def workflow_table(study: dict[str, float], plan: pd.Series) -> str:
         f"planning {plan['runs']:.0f} runs, `snakemake -n`": f"{plan['seconds']:.1f} s",
     }
     return markdown(pd.DataFrame(rows.items(), columns=["what", "measured"]), ["measured"])
+
+
+def start_table(starts: pd.DataFrame) -> str:
+    """Seconds of each part, and of a job those by hand; the ratio is taken within a repeat."""
+    columns = {"cpu_seconds": "CPU time", "seconds": "wall time"}
+    table = starts.pivot(index="repeat", columns="what", values=list(columns))
+    rows = {
+        f"{what}, s": [median_and_range(table[column][what], ".2f") for column in columns]
+        for what in starts["what"].unique()
+    }
+    rows["job ÷ by hand"] = [
+        median_and_range(table[column][start.JOB] / table[column][start.HAND], ".2f")
+        for column in columns
+    ]
+    found = pd.DataFrame(rows, index=list(columns.values())).T
+    return markdown(found.reset_index(names="start and end of a run"), list(columns.values()))
+
+
+def median_and_range(values: pd.Series, form: str) -> str:
+    """Over the repeats."""
+    numbers = (format(value, form) for value in (values.median(), values.min(), values.max()))
+    return "{} ({} to {})".format(*numbers)
 
 
 # --- pictures -------------------------------------------------------------------------------------

@@ -46,6 +46,8 @@ class Scale:
     growth_episodes: int
     workflow_episodes: int  # of each run of the small workflow ...
     workflow_seeds: int  # ... and how many of them, 3 environments × 3 variants
+    start_repeats: int
+    start_jobs: int  # of the workflow whose jobs do nothing but start and end
     planned_seeds: int  # of the workflow that is only planned, with every variant there is
 
 
@@ -60,6 +62,8 @@ FULL = Scale(
     growth_episodes=400,
     workflow_episodes=200,
     workflow_seeds=2,
+    start_repeats=5,
+    start_jobs=4,
     planned_seeds=200,
 )
 _QUICK = ROOT / "benchmarks" / "quick"
@@ -74,5 +78,7 @@ QUICK = Scale(
     growth_episodes=50,
     workflow_episodes=5,
     workflow_seeds=1,
+    start_repeats=1,
+    start_jobs=2,
     planned_seeds=20,
 )

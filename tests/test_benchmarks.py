@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import breakdown, growth, report, settings, speed, wrapper
+from benchmarks import breakdown, growth, report, settings, speed, start, wrapper
 from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FULL, HOPPER, OURS, VARIANTS
 
 
@@ -52,6 +52,12 @@ def data(tmp_path):
     pd.concat(everywhere).to_csv(tmp_path / "workflow.csv")
     jobs.to_csv(tmp_path / "jobs.csv")
     pd.DataFrame({"runs": [3000], "seconds": [12.3]}).to_csv(tmp_path / "planning.csv")
+    starts = [
+        {"what": what, "repeat": repeat, "seconds": 2.0 * cpu, "cpu_seconds": cpu}
+        for repeat in range(3)
+        for what, cpu in ((start.HAND, 1.0 + repeat), (start.JOB, 2.0 + repeat))
+    ]
+    pd.DataFrame(starts).to_csv(tmp_path / "start.csv")
     index = pd.MultiIndex.from_product([wrapper.NAMES, wrapper.WHERE], names=["env", "where"])
     costs = [pd.DataFrame({wrapper.TIME: time}, index) for time in (1.0, 3.0)]
     pd.concat(costs).reset_index().to_csv(tmp_path / "wrapper.csv")
@@ -103,6 +109,8 @@ def test_report_is_written_from_the_data(data):
         "| peak memory of one training | 350 MB |",
         "| ppo | 350 | 350 | 350 |",
         "| walk | 40 | 400 | 1110000.0 | 3.000 | 80 | 400 |",
+        "| a job of the workflow, s | 3.00 (2.00 to 4.00) | 6.00 (4.00 to 8.00) |",
+        "| job ÷ by hand | 1.50 (1.33 to 2.00) | 1.50 (1.33 to 2.00) |",
         "| planning (`snakemake -n`) of 3000 runs | 12 s |  | ≤ 60 s | ≤ 20 s |",
         f"| CartPole-v1 |{' 2.0 (1.0 to 3.0) |' * 5}",
     ):
