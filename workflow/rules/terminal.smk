@@ -57,7 +57,6 @@ onstart:
 
 onsuccess:
     for folder in {Path(episodes).parent for episodes in EPISODES}:
-        if (
-            folder / files.RECORD
-        ).exists():  # not of a run that was not asked for and is unfinished
+        # Not of an unfinished run, which was not asked for this time.
+        if (folder / files.RECORD).exists():
             (folder / files.CHECKPOINT).unlink(missing_ok=True)
