@@ -18,12 +18,14 @@ import yaml
 from PIL import Image
 
 from mace_rl import files
+from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import read_study
 from mace_rl.report.animations import animations
 from mace_rl.report.page import Making, duration, number, read_tables
 from mace_rl.report.page import page as build
 from mace_rl.report.workflow_graph import graph
 from mace_rl.results.claims import LITERAL, ROBUST
+from mace_rl.results.comparisons import regret
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.provenance import read_record
@@ -38,9 +40,9 @@ needs_browser = pytest.mark.skipif(
 )
 # All but training, which is done here in one process.
 RULES = ["metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure"]
-RULES += ["claims", "page"]
+RULES += ["pictures", "readings", "claims", "page"]
 SECTIONS = ["verdicts", "learning", "table1", "agents", "beta"]
-SECTIONS += ["statistics", "ledger", "costs", "workflow", "configuration"]
+SECTIONS += ["ranking", "statistics", "ledger", "costs", "workflow", "configuration"]
 MOST_BYTES = 25_000_000
 
 
@@ -180,6 +182,10 @@ def test_figures_have_a_panel_for_each_environment(page: Page) -> None:
         assert len(page.all(section, "svg")) == len(ENVIRONMENTS)
         assert all(environment in page.text[section] for environment in ENVIRONMENTS)
     assert "PPO (Baseline)" not in page.words("beta")
+    assert [one["aria-label"] for one in page.all("ranking", "svg")] == ["readings"]
+    shown = [one["aria-label"] for one in page.all("statistics", "svg")]
+    assert shown == ["every seed", "profiles"]
+    assert "returns shuffled" in page.words("ranking")
 
 
 @needs_browser
@@ -225,17 +231,25 @@ def test_costs_workflow_and_configuration(page: Page, made: Path) -> None:
 
 @needs_browser
 def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, tmp_path: Path) -> None:
-    """PPO on CartPole alone, from the same files; made twice, it is the same."""
+    """From the same files, some left out, with a regret; made twice, it is the same."""
     study = read_study([made / "config.yaml", made / "tiny.yaml"])
-    settings = study.metrics.within(study.environments, study.variants)
+    regret_of = {"variant": "mace_full", "constants": ["ppo", "mace_fixed"]}
+    settings = study.metrics.within(study.environments, study.variants).model_copy(
+        update={"regret": RegretConfig(**regret_of)}
+    )
     results = made / "results"
     found = {name: results / f"{name}.csv" for name in ("metrics", "table1", "supplement")}
     found |= {name: results / f"{name}.csv" for name in ("comparisons", "aggregate")}
+    found |= {name: results / f"{name}.csv" for name in ("profiles", "readings")}
     for figure in "12":
         found |= {f"curves{figure}": results / f"figure{figure}.csv"}
         found |= {f"seeds{figure}": results / f"figure{figure}_seeds.csv"}
     tables = read_tables(found, study.runs(), settings)
-    tables = replace(tables, curves={**tables.curves, "2": tables.curves["2"].head(0)})
+    tables = replace(
+        tables,
+        curves={**tables.curves, "2": tables.curves["2"].head(0)},
+        regret=regret(tables.metrics, settings),
+    )
     records = [read_record(path) for path in results.glob("runs/*/*/*/run.json")]
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo.model_dump()}
     making = Making(
@@ -250,8 +264,11 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, tmp_path: Pa
     assert page.words("verdicts").startswith("Verdicts There are no verdicts")
     assert "This study has no ledger" in page.words("ledger")
     for variant in VARIANTS:
-        assert f"runs/{variant} has no agent.pt" in page.words("agents")
+        assert f"runs/{variant}" in page.words("agents")
+    assert "Not shown, because agent.pt is not there" in page.words("agents")
     assert not page.all("agents", "img")
+    assert "regret" in [one.get("aria-label") for one in page.all("statistics", "svg")]
+    assert "loses against the best constant" in page.words("statistics")
     assert "β is 0 throughout" in page.words("beta")
     assert "on the command line over them seeds=0, 1" in page.words("configuration")
 

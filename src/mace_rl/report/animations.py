@@ -41,11 +41,23 @@ def animations(
     agents do the same share that film. An agent that is not there and an environment that cannot be
     drawn are said; an agent that is not the one of its `run.json` is an error.
     """
-    found = Animations()
+    found, without = Animations(), []
+    for folder in runs.values():
+        if not (folder / files.AGENT).exists():
+            without.append(str(folder.relative_to(origin)))
+    if without:
+        names = ", ".join(without)
+        found.missing.append(
+            f"Not shown, because {files.AGENT} is not there, are the agents of {names}."
+        )
     for environment in dict.fromkeys(environment for environment, _ in runs):
-        folders = {variant: runs[env, variant] for env, variant in runs if env == environment}
+        folders = {
+            variant: folder
+            for (env, variant), folder in runs.items()
+            if env == environment and (folder / files.AGENT).exists()
+        }
         try:
-            shown = _of_one(folders, labels, found.missing, origin)
+            shown = _of_one(folders, labels)
         except RenderError as error:
             found.missing.append(f"{error}.")
             continue
@@ -54,17 +66,11 @@ def animations(
     return found
 
 
-def _of_one(
-    folders: Mapping[str, Path], labels: Mapping[str, str], missing: list[str], origin: Path
-) -> list[Animation]:
+def _of_one(folders: Mapping[str, Path], labels: Mapping[str, str]) -> list[Animation]:
     """Of one environment: untrained agents first, then the trained ones."""
     untrained: dict[bytes, tuple[Film, list[str]]] = {}
     trained = []
     for variant, folder in folders.items():
-        if not (folder / files.AGENT).exists():
-            name = folder.relative_to(origin) if folder.is_relative_to(origin) else folder
-            missing.append(f"{name} has no {files.AGENT}, so its agent cannot be shown.")
-            continue
         before = film(folder, untrained=True, width=WIDTH, seconds=SECONDS)
         untrained.setdefault(gif(before), (before, []))[1].append(variant)
         after = film(folder, width=WIDTH, seconds=SECONDS)

@@ -18,12 +18,14 @@ from matplotlib.colors import to_hex
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.report.animations import Animations
-from mace_rl.report.panels import panels
+from mace_rl.report.panels import panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST
 from mace_rl.results.figures import quantity
 from mace_rl.results.metrics import all_metrics, read_metrics
 from mace_rl.results.paper import PAPER_METRICS
+from mace_rl.results.pictures import draw_every_seed, draw_profiles, draw_regret
+from mace_rl.results.readings import draw_readings, in_order, ranked, title
 from mace_rl.results.records import RunKey
 from mace_rl.results.tables import DIGITS
 
@@ -42,6 +44,8 @@ class Tables:
     supplement: pd.DataFrame
     comparisons: pd.DataFrame
     aggregate: pd.DataFrame
+    profiles: pd.DataFrame
+    readings: pd.DataFrame
     curves: Mapping[str, pd.DataFrame]  # by the figure's number
     single_seeds: Mapping[str, pd.DataFrame]
     regret: pd.DataFrame | None  # where the configuration asks for it
@@ -52,7 +56,7 @@ def read_tables(
     found: Mapping[str, Any], runs: Sequence[RunKey], settings: MetricsConfig
 ) -> Tables:
     """The data of these runs, from the files `found` by the names that the rule `page` has."""
-    names = ("table1", "supplement", "comparisons", "aggregate")
+    names = ("table1", "supplement", "comparisons", "aggregate", "profiles", "readings")
     claims = found.get("claims")
     return Tables(
         metrics=read_metrics(found["metrics"], runs, settings),
@@ -122,6 +126,8 @@ def page(
         curved={name: set(curves["variant"]) for name, curves in tables.curves.items()},
         table1=_table1(tables.table1),
         animations=animations,
+        pictures=_pictures(tables, settings, labels, colours),
+        readings=_readings(tables.readings, settings),
         aggregate=tables.aggregate.to_dict("records"),
         comparisons=_with_units(tables.comparisons, settings),
         supplement=_with_units(tables.supplement, settings),
@@ -215,6 +221,36 @@ def _table1(table: pd.DataFrame) -> list[dict[str, Any]]:
             )
         blocks.append({"environment": environment, "rows": rows})
     return blocks
+
+
+def _pictures(
+    tables: Tables,
+    settings: MetricsConfig,
+    labels: Mapping[str, str],
+    colours: Mapping[str, str],
+) -> dict[str, str]:
+    """Those that are wider than a phone, as SVG by name; `regret` only where it is asked for."""
+    drawn = {
+        "readings": draw_readings(tables.readings, labels, colours, settings),
+        "every_seed": draw_every_seed(tables.metrics, labels, colours),
+        "profiles": draw_profiles(tables.profiles, labels, colours),
+    }
+    if settings.regret:
+        how = settings.regret, settings, labels, colours
+        drawn["regret"] = draw_regret(tables.metrics, *how)
+    return {name: svg(figure, name, name.replace("_", " ")) for name, figure in drawn.items()}
+
+
+def _readings(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]:
+    """A row per reading: for each environment the variants, the first one first."""
+    rows = []
+    for key, own in in_order(table):
+        cells = []
+        for environment in table["env"].unique():
+            ordered, is_first = ranked(own[own["env"] == environment])
+            cells.append({"variants": ordered.to_dict("records"), "is_first": is_first})
+        rows.append({"title": title(*key, settings), "cells": cells})
+    return rows
 
 
 def _with_units(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[Any, Any]]:

@@ -11,6 +11,9 @@ from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.results.figures import Quantity, draw_figure, figure_as_svg
 
 WIDTH, HEIGHT = 3.3, 2.5  # inches: letters of a readable size on a phone
+# What figures draw in black (seaborn: almost), light grey and white, in light and in dark.
+PAGE_COLOURS = {"#000000": "currentColor", "#262626": "currentColor"}
+PAGE_COLOURS |= {"#e6e6e6": "var(--line)", "#ffffff": "var(--card)"}
 MAX_POINTS = 250  # per curve: a point for every pixel and a half
 
 
@@ -41,7 +44,7 @@ def panels(
         for legend in figure.legends:
             legend.remove()
         figure.set_size_inches(WIDTH, HEIGHT)
-        drawn[str(environment)] = _svg(figure, f"{shown.name}-{len(drawn)}", str(environment))
+        drawn[str(environment)] = svg(figure, f"{shown.name}-{len(drawn)}", str(environment))
     return drawn
 
 
@@ -51,12 +54,13 @@ def _thinned(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[frame["episode"].isin(kept)]
 
 
-def _svg(figure: Figure, name: str, label: str) -> str:
+def svg(figure: Figure, name: str, label: str) -> str:
     """A figure as an SVG element whose ids begin with `name`."""
     text = figure_as_svg(figure)
     text = text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
     text = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", text)
     # A tenth of a point is a seventh of a pixel; long decimals are half the file.
     text = re.sub(r"(-?\d+\.\d)\d+", r"\1", text)
-    # What seaborn draws almost black is drawn in the colour of the page's text.
-    return text.replace("#262626", "currentColor").replace("#000000", "currentColor")
+    for colour, of_page in PAGE_COLOURS.items():
+        text = text.replace(colour, of_page)
+    return text

@@ -173,13 +173,13 @@ def markdown(table: pd.DataFrame, settings: MetricsConfig) -> str:
         f"| episodes | {' | '.join(environments)} |",
         "|---" * (1 + len(environments)) + "|",
     ]
-    for (kind, reading, source), rows in _in_order(table):
+    for (kind, reading, source), rows in in_order(table):
         cells = [_ranking(rows[rows["env"] == name]) for name in environments]
         lines.append(f"| {title(kind, reading, source, settings)} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def _in_order(
+def in_order(
     table: pd.DataFrame,
 ) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
     """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
@@ -197,15 +197,22 @@ def _ranking(rows: pd.DataFrame) -> str:
     """The variants in the order of their means."""
     if rows.empty:
         return ""
-    ordered = rows.sort_values("mean", kind="stable")
+    ordered, is_first = ranked(rows)
     cells = [
         f"{row.variant} {float(str(row.mean)):.0f}{'†' if row.censored else ''}"
         for row in ordered.itertuples(index=False)
     ]
-    others = ordered["p_value"].iloc[1:]
-    if others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1:
+    if is_first:
         cells[0] = f"**{cells[0]}**"
     return ", ".join(cells)
+
+
+def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
+    """The rows in the order of their means, and whether the first place is more than chance."""
+    ordered = rows.sort_values("mean", kind="stable")
+    others = ordered["p_value"].iloc[1:]
+    sure = others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1
+    return ordered, bool(sure)
 
 
 def draw_readings(
@@ -217,8 +224,9 @@ def draw_readings(
     """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
     from matplotlib.figure import Figure
 
-    environments, lines = list(table["env"].unique()), _in_order(table)
+    environments, lines = list(table["env"].unique()), in_order(table)
     variants = list(table["variant"].unique())
+    step = min(0.22, 0.8 / len(variants))  # of a line, from variant to variant
     with style():
         height = 0.34 * len(lines) + 2 * LEGEND_HEIGHT
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
@@ -228,7 +236,7 @@ def draw_readings(
                 own = rows[rows["env"] == environment].set_index("variant")
                 for name in own.index:
                     row = own.loc[name]
-                    shift = 0.22 * (variants.index(name) - (len(variants) - 1) / 2)
+                    shift = step * (variants.index(name) - (len(variants) - 1) / 2)
                     colour = colours[name]
                     axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
                     axes.plot(
