@@ -39,7 +39,7 @@ tables: setup ## every table, figure and verdict from the runs in reference/, wi
 	@$(IN_VENV) tools.tables
 
 numbers: setup ## write what the tables of reference/ say into README and docs
-	@$(IN_VENV) tools.numbers
+	@$(IN_VENV) tools.printed
 
 report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=controls)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),controls)

@@ -11,7 +11,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from tests.test_claims import table
-from tools import numbers, show
+from tools import printed, show
 
 ROOT = Path(__file__).parents[1]
 
@@ -20,10 +20,10 @@ def test_the_pages_say_what_the_kept_tables_say(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
-    numbers.main()
-    printed = capsys.readouterr().out
-    assert printed.endswith("marked texts, 0 differ\n")
-    assert int(printed.split()[0]) >= 5
+    printed.main()
+    said = capsys.readouterr().out
+    assert said.endswith("marked texts, 0 differ\n")
+    assert int(said.split()[0]) >= 5
 
 
 def test_a_number_that_is_not_printed_is_refused_and_mended(
@@ -35,21 +35,21 @@ def test_a_number_that_is_not_printed_is_refused_and_mended(
     page.write_text(
         "<!-- python -m tools.show means reference/tables/baseline -->\n9\n<!-- end -->"
     )
-    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    monkeypatch.setattr(printed, "ROOT", tmp_path)
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
     with pytest.raises(SystemExit, match=r"README\.md: means reference/tables/baseline"):
-        numbers.main()
+        printed.main()
     assert "\n9\n" in page.read_text()
     monkeypatch.setattr("sys.argv", ["numbers"])
-    numbers.main()
+    printed.main()
     assert "| Acrobot-v1 | ppo | 20 |" in page.read_text()
     page.write_text("<!-- python -m tools.show means reference/none -->\n<!-- end -->")
     with pytest.raises(SystemExit, match="reference/none"):
-        numbers.main()
+        printed.main()
 
 
 def test_the_study_page_has_no_number_of_its_own() -> None:
-    text = numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
+    text = printed.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
 

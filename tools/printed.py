@@ -1,6 +1,6 @@
 """README and docs say what the kept results say: the text between marks is what a command prints.
 
-    .venv/bin/python -m tools.numbers [--check]        (make numbers)
+    .venv/bin/python -m tools.printed [--check]        (make numbers)
 
 A mark is `<!-- python -m tools.show WHAT FOLDER ... -->`; its text, to `<!-- end -->`, is what that
 prints. With --check nothing is written, and a text that says something else is a mistake.
