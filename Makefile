@@ -41,8 +41,8 @@ tables: setup ## every table, figure and verdict from the runs in reference/, wi
 numbers: setup ## write what the tables of reference/ say into README and docs
 	@$(IN_VENV) tools.printed
 
-report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=controls)
-	@$(IN_VENV) tools.tables --report $(or $(STUDY),controls)
+report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
+	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)
 
 bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)

@@ -41,6 +41,7 @@ OUTPUTS = [
 ]
 EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1}
 EVALUATION |= {"curves": 2, "figure": 2, "pictures": 1, "readings": 1}
+DRAWN = {"figure": 2, "pictures": 1, "readings": 1}
 
 
 class Project:
@@ -169,9 +170,9 @@ def test_time_stamps_do_not_count(finished: Project) -> None:
 
 TRAIN = {"train": 6, **EVALUATION}
 CHANGES = {  # of a file, from one text to another, and what is to be done then
-    "a colour": ("config.yaml", "tab:blue", "tab:cyan", {"figure": 2}),
+    "a colour": ("config.yaml", "tab:blue", "tab:cyan", DRAWN),
     "the colour of a variant that is not run": ("config.yaml", "tab:purple", "tab:pink", {}),
-    "a name": ("config.yaml", "PPO (", "Plain PPO (", {"table1": 1, "figure": 2}),
+    "a name": ("config.yaml", "PPO (", "Plain PPO (", {"table1": 1} | DRAWN),
     "how runs are measured": ("config.yaml", "threshold: 0.75", "threshold: 0.7", EVALUATION),
     "what all use": ("config.yaml", "clip: 0.2", "clip: 0.3", TRAIN | {"table2": 1}),
     "what the bonus uses": (
@@ -224,7 +225,8 @@ def test_a_colour_redraws_the_figures_and_touches_nothing_else(finished: Project
     edit("config.yaml", "tab:green", "tab:olive")
     assert finished("snakemake -j2 all")[0] == 0
     changed = {name for name, value in finished.digests().items() if value != before[name]}
-    assert changed == {"figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"}
+    drawn = ("figure1", "figure2", "every_seed", "profiles", "readings")
+    assert changed == {f"{name}.{kind}" for name in drawn for kind in ("pdf", "png")}
     edit("config.yaml", "tab:olive", "tab:green")
     assert finished("snakemake -j1 all")[0] == 0
     assert finished.digests() == before  # drawing is deterministic
