@@ -6,8 +6,8 @@ Libraries ask the processor what it can do, and who made it, and choose their co
 qemu-user the emulated processor answers. Every environment and variant is trained for some episodes
 on this processor, and again under each emulated one, which compiles everything for itself.
 Trainings are also begun here and ended there, and the other way round. What is there in the end has
-to equal the undisturbed training here byte for byte. So have Table 1 and Figure 1 made there of the
-kept runs in reference/, which hold those of this processor or another.
+to equal the undisturbed training here byte for byte. So have Table 1 and Figure 1, made of the kept
+runs in reference/.
 
 An emulator does what the instructions are defined to do. So this finds whatever depends on which
 instructions are chosen, but not what real processors make of the same ones.
@@ -247,11 +247,12 @@ def emulate(
 
 def judge(training: Training, scratch: Path) -> bool:
     """Whether a training ended as the undisturbed one here did; prints a line that says so."""
+    undisturbed = training._replace(processor=HERE, half="")
     if training.environment == str(TABLES):
-        pairs = ((ROOT / TABLES / name, scratch / str(training) / name) for name in TABLE_FILES)
+        folders = scratch / str(undisturbed), scratch / str(training)
+        pairs = ([folder / name for folder in folders] for name in TABLE_FILES)
         found = ", ".join(a.name for a, b in pairs if a.read_bytes() != b.read_bytes())
     else:
-        undisturbed = training._replace(processor=HERE, half="")
         found = difference(scratch / str(undisturbed), scratch / str(training), bool(training.half))
     print(f"{training}: {f'DIFFERENT: {found}' if found else 'equal'}", flush=True)
     return not found
@@ -314,9 +315,7 @@ def main() -> None:
     arguments = parser.parse_args()
     emulator, engine = qemu(), arguments.engine
     trainings = planned(arguments.short)
-    undisturbed = dict.fromkeys(
-        t._replace(processor=HERE, half="") for t in trainings if t.environment != str(TABLES)
-    )
+    undisturbed = dict.fromkeys(t._replace(processor=HERE, half="") for t in trainings)
     first = [(t, False) for t in undisturbed] + [(t, True) for t in trainings if t.half == "begun"]
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
