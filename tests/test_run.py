@@ -145,7 +145,7 @@ from mace_rl.runs import run
 from mace_rl.config.run import RunConfig
 from mace_rl.train import Trainer
 
-run.CHECKPOINT_SECONDS, run.CHECKPOINT_COST = 0, float("inf")
+run.CHECKPOINT_COST = float("inf")
 improve = Trainer.improve
 
 def improve_until_12(self, rollout):
@@ -169,7 +169,8 @@ def test_a_process_killed_by_sigkill_is_resumed_by_another(
     config = run_config("HopperBulletEnv-v0", "mace_full", 5, episodes=20)
     directory = tmp_path / "Läufe mit Leerzeichen"
     command = [sys.executable, "-c", CHILD, config.model_dump_json(), str(directory)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    often = {**os.environ, "MACE_RL_CHECKPOINT_SECONDS": "0"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=often) as process:
         try:
             assert any(line == "ready\n" for line in process.stdout)
             before = {name: (directory / name).read_bytes() for name in files(directory)}

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
 START_SHARE = 0.01  # of the episodes, which wait for their code to be compiled
 # A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
-CHECKPOINT_SECONDS = 10.0
+CHECKPOINT_SECONDS = float(os.environ.get("MACE_RL_CHECKPOINT_SECONDS", "10"))
 CHECKPOINT_COST = 0.01
 # A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
 LOCK_SECONDS = 5.0
