@@ -277,7 +277,7 @@ def _detectable(differences: Sequence[np.ndarray], confidence: float) -> float:
         return np.nan
     variances = [np.var(values, ddof=1) / len(values) for values in differences]
     error = np.sqrt(np.sum(variances)) / len(differences)
-    quantiles = scipy.stats.t.ppf([(1 + confidence) / 2, POWER], freedom)
+    quantiles = scipy.special.stdtrit(freedom, [(1 + confidence) / 2, POWER])
     return float(quantiles.sum() * error)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads scipy.stats when it is first used: importing this module stays fast
+import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
 
 BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
 CHUNK = 2**22  # resampled values held in memory at a time
@@ -41,7 +41,7 @@ def mean_interval(
         return np.full_like(mean, np.nan), np.full_like(mean, np.nan)
     if interval_kind(seeds) == "t":
         error = np.std(values, axis=0, ddof=1) / np.sqrt(seeds)
-        half = scipy.stats.t.ppf((1 + confidence) / 2, seeds - 1) * error
+        half = scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2) * error
         return mean - half, mean + half
     chosen = generator.integers(seeds, size=(repetitions, seeds))
     flat = values.reshape(seeds, -1)  # [seeds, points]
@@ -107,7 +107,7 @@ def stratified_comparison(
     if interval_kind(smallest) == "t":
         errors = [np.var(values, ddof=1) / len(values) for values in differences]
         error = np.sqrt(np.sum(errors)) / len(differences)
-        half = float(scipy.stats.t.ppf((1 + confidence) / 2, smallest - 1) * error)
+        half = float(scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error)
         return tested._replace(low=tested.difference - half, high=tested.difference + half)
     means = [
         np.mean(values[generator.integers(len(values), size=(repetitions, len(values)))], axis=1)
@@ -199,6 +199,6 @@ def percentiles(resampled: np.ndarray, confidence: float, seeds: int) -> np.ndar
     """
     if seeds == 1:
         return np.full((2, *resampled.shape[1:]), np.nan)
-    wider = np.sqrt(seeds / (seeds - 1)) * scipy.stats.t.ppf((1 + confidence) / 2, seeds - 1)
-    tail = 100 * scipy.stats.norm.sf(wider)
+    wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
+    tail = 100 * scipy.special.ndtr(-wider)
     return np.percentile(resampled, [tail, 100 - tail], axis=0)
