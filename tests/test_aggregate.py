@@ -37,6 +37,18 @@ def test_scores_are_between_random_and_the_best_run(study: Study) -> None:
     assert found.groupby(["env", "metric"]).max().tolist() == [1.0] * 4
 
 
+def test_an_environment_that_nobody_is_better_in_than_random_counts_as_zero(study: Study) -> None:
+    frame = table(SEEDS)
+    for metric in a.SCORED:
+        frame.loc[frame["env"] == "HopperBulletEnv-v0", metric] = -3.0
+    found = a.scores(frame, study.metrics)
+    assert set(found.loc[found["env"] == "HopperBulletEnv-v0", "score"]) == {0.0}
+    other = a.scores(frame[frame["env"] == "CartPole-v1"], study.metrics)
+    means = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])["mean"]
+    for (metric, variant), runs in other.groupby(["metric", "variant"]):
+        assert means[metric, variant] == pytest.approx(runs["score"].sum() / 22)
+
+
 def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
     values = np.array([9.0, -100, 3, 4, 5, 6, 1000, 0])
     assert a.interquartile_mean(values) == np.mean([3, 4, 5, 6])

@@ -1,19 +1,39 @@
 """Pictures of all runs at once: their data against loops, and what they draw."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import Study
+from mace_rl.report.panels import svg
 from mace_rl.results import pictures
 from mace_rl.results.aggregate import SCORED, scores
-from mace_rl.results.figures import save_figure
+from mace_rl.results.figures import figure_as_svg, save_figure
 from tests.test_aggregate import SEEDS, table
 
 NAMES = {"ppo": "PPO", "mace_full": "Full"}
 COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
+
+
+def test_a_panel_of_the_page_says_and_shows_what_the_figure_does() -> None:
+    figure = Figure(figsize=(3, 2))
+    axes = figure.subplots()
+    axes.plot([0.975, 0.995], [0.123456, 0.2], alpha=0.19)
+    axes.set_yticks([0.125, 0.175])
+    whole, small = figure_as_svg(figure), svg(figure, "name", "label")
+    for shown in (r"<text[^>]*>([^<]*)<", r"opacity: ([\d.]+)", r"stroke-width: ([\d.]+)"):
+        assert re.findall(shown, small) == re.findall(shown, whole) != []
+    paths = [
+        re.findall(r"-?\d+(?:\.\d+)?", " ".join(re.findall(r' d="([^"]+)"', text)))
+        for text in (whole, small)
+    ]
+    np.testing.assert_allclose(*(np.array(path, float) for path in paths), atol=0.1)
+    assert max(len(number.partition(".")[2]) for number in paths[1]) == 1
 
 
 def test_a_profile_is_the_share_of_runs_that_are_at_least_so_good(study: Study) -> None:

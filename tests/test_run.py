@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -523,6 +524,14 @@ def test_progress_says_how_far_it_is(interrupted):
 
 
 # --- When a checkpoint is due -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("said", ["often", "-1", "nan", "inf", ""])
+def test_a_time_between_checkpoints_that_cannot_be(run_config, tmp_path, monkeypatch, said):
+    monkeypatch.setenv("MACE_RL_CHECKPOINT_SECONDS", said)
+    refusal = f"MACE_RL_CHECKPOINT_SECONDS is {said!r}, but should be a number of seconds"
+    with pytest.raises(run.RunError, match=re.escape(refusal)):
+        run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path)
 
 
 @pytest.mark.parametrize(("cost", "wait"), [(0.01, 10.0), (0.1, 10.0), (0.5, 50.0), (3.0, 300.0)])

@@ -83,8 +83,11 @@ def test_whoever_installs_the_package_gets_its_types(tmp_path):
     subprocess.run([*command, "-w", "wheel", "."], cwd=tmp_path, check=True)
     (wheel,) = (tmp_path / "wheel").iterdir()
     packed = set(zipfile.ZipFile(wheel).namelist())
-    modules = {str(p.relative_to(ROOT / "src")) for p in (ROOT / "src/mace_rl").rglob("*.py")}
-    assert modules | {"mace_rl/py.typed"} <= packed
+    files = (path for path in (ROOT / "src/mace_rl").rglob("*") if path.is_file())
+    wanted = {
+        str(path.relative_to(ROOT / "src")) for path in files if "__pycache__" not in path.parts
+    }
+    assert "mace_rl/report/page.html" in wanted and wanted <= packed
 
 
 # --- make, with a Python that only pretends to install ------------------------------------------

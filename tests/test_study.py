@@ -241,6 +241,18 @@ def test_files_are_read_over_one_another(tmp_path: Path) -> None:
         read_study([CONFIG, overlay])
 
 
+OVERLAYS = [[path.name] for path in sorted((CONFIG.parent / "config").glob("*.yaml"))]
+COMBINED = [[name, "exploration.yaml"] for name in ("controls.yaml", "ablations.yaml")]
+
+
+@pytest.mark.parametrize("names", [*OVERLAYS, *COMBINED], ids=" + ".join)
+def test_every_study_of_the_project_can_be_carried_out(names: list[str]) -> None:
+    study = read_study([CONFIG, *(CONFIG.parent / "config" / name for name in names)])
+    for run in study.runs():
+        study.run_config(*run)
+    study.metrics.within(study.environments, study.variants)
+
+
 def test_merge_as_snakemake_does() -> None:
     from snakemake.utils import update_config
 

@@ -281,7 +281,7 @@ def test_one_snakemake_at_a_time(finished: Project, edit) -> None:
         assert code == 1
         refusal = "Error: Snakemake (process 7 on moon) is at work in results; wait for it"
         assert refusal in output.splitlines()
-        assert finished.planned() == {"figure": 2}  # looking is allowed
+        assert finished.planned() == DRAWN  # looking is allowed
 
 
 def test_success_removes_the_checkpoints_of_finished_runs_alone(finished: Project) -> None:

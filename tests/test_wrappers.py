@@ -556,6 +556,12 @@ def test_mistakes_get_one_line(settings, message, vector):
     assert "\n" not in str(caught.value)
 
 
+def test_a_bandit_is_for_one_environment():
+    """It has to see how an episode ended before it chooses for the next."""
+    with pytest.raises(ConfigError, match=r"bandit.*2 go on at once"):
+        VectorCuriosityReward(vector_of("CartPole-v1", 2, AutoresetMode.NEXT_STEP), BANDIT)
+
+
 def test_arguments_that_there_are_not():
     """Python's own message; help() and editors show those that there are, the same for both."""
     with pytest.raises(TypeError, match="unexpected keyword argument 'gamma'"):

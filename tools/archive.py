@@ -9,6 +9,7 @@ ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to t
 equal runs give equal files.
 """
 
+import argparse
 import io
 import lzma
 import sys
@@ -82,13 +83,19 @@ def unpack(archives: Path, results: Path) -> int:
 def main() -> None:
     """Entry point."""
     commands = {"pack": pack, "unpack": unpack}
-    if len(sys.argv) != 4 or sys.argv[1] not in commands:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.archive pack results reference/study",
+    )
+    parser.add_argument("command", choices=commands)
+    parser.add_argument("origin", type=Path, help="RESULTS to pack, or the ARCHIVE to unpack")
+    parser.add_argument("goal", type=Path, help="the ARCHIVE, or RESULTS")
+    arguments = parser.parse_args()
     try:
-        count = commands[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))
+        count = commands[arguments.command](arguments.origin, arguments.goal)
     except (ValueError, OSError, tarfile.TarError, lzma.LZMAError) as error:
         sys.exit(f"archive: {error}")
-    print(f"{count} runs in {sys.argv[3]}")
+    print(f"{count} runs in {arguments.goal}")
 
 
 if __name__ == "__main__":

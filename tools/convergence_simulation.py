@@ -1,6 +1,6 @@
 """Which reading of the paper's "slope of the moving average becomes minimal" is steadiest?
 
-.venv/bin/python tools/convergence_simulation.py [FOLDER_OF_RUNS ...]
+    .venv/bin/python -m tools.convergence_simulation [FOLDER_OF_RUNS ...]
 
 Each reading is applied to 300 simulated learning curves of four shapes, whose mean is the same and
 known, with the noise of the three environments; and to 300 that begin to learn a tenth of the
@@ -10,7 +10,7 @@ than another (50: the reading does not see a difference). A folder of runs, such
 adds the median ± the standard deviation over seeds of each environment and variant in it.
 """
 
-import sys
+import argparse
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -165,9 +165,15 @@ def real_columns(folder: Path) -> dict[str, list[str]]:
 
 def main() -> None:
     """Print the table, as Markdown."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.convergence_simulation results/runs",
+    )
+    parser.add_argument("folders", type=Path, nargs="*", help="of runs")
+    folders: list[Path] = parser.parse_args().folders
     columns = {shape: column(shape) for shape in SHAPES}
-    for folder in sys.argv[1:]:
-        columns |= real_columns(Path(folder))
+    for folder in folders:
+        columns |= real_columns(folder)
     print("|", " | ".join(["", *columns]), "|")
     print("|---" * (1 + len(columns)) + "|")
     for name, *cells in zip(READINGS, *columns.values(), strict=True):

@@ -1,13 +1,13 @@
 """How often do the intervals of the tables hold the true value? By simulation.
 
-.venv/bin/python tools/coverage.py [REPEATS]
+    .venv/bin/python -m tools.coverage [REPEATS]
 
 For 10 and 20 seeds and several distributions over seeds: the share of REPEATS (2000) simulated
 studies whose nominal 95 % interval holds the truth, in %, for the mean, the interquartile mean and
 the probability of improvement over a variant of the same distribution (truth: one half).
 """
 
-import sys
+import argparse
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -66,4 +66,8 @@ def main(repeats: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2000)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.coverage 500"
+    )
+    parser.add_argument("repeats", type=int, nargs="?", default=2000, help="(default: 2000)")
+    main(parser.parse_args().repeats)

@@ -7,6 +7,7 @@ all that. Times, owners and order depend on the commit only. It is not compresse
 differ from version to version, and most of it is compressed already.
 """
 
+import argparse
 import hashlib
 import io
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from mace_rl.files import write_atomically
 
+ROOT = Path(__file__).resolve().parent.parent
 SUMS = "SHA256SUMS"
 
 
@@ -66,11 +68,15 @@ def deposit(repository: Path) -> tuple[str, bytes]:
 
 def main() -> None:
     """Entry point."""
-    if len(sys.argv) > 2:
-        sys.exit(__doc__)
-    folder = Path(sys.argv[1] if len(sys.argv) == 2 else "dist")
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.deposit /tmp/dist"
+    )
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=Path("dist"), help="(default: dist)"
+    )
+    folder: Path = parser.parse_args().folder
     try:
-        name, data = deposit(Path.cwd())
+        name, data = deposit(ROOT)
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / name, data)
     except (DepositError, OSError) as error:

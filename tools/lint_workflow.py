@@ -3,6 +3,7 @@
 One lock serves all rules here, so no rule names a conda environment or container of its own.
 """
 
+import argparse
 import contextlib
 import io
 import json
@@ -31,6 +32,9 @@ def lints(snakefile: Path) -> list[tuple[str, str]]:
 
 def main() -> None:
     """Print what is left of the lints and fail if that is anything."""
+    argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.lint_workflow"
+    ).parse_args()
     left = [lint for lint in lints(Path("Snakefile")) if lint[1] != ACCEPTED]
     for where, title in left:
         print(f"{where}: {title}", file=sys.stderr)

@@ -1,6 +1,6 @@
 """How much of β's credit is signal, for each objective tried, and how well it knows the update.
 
-.venv/bin/python tools/meta_signal.py ENVIRONMENT EPISODES SEEDS [CONFIG ...]
+    .venv/bin/python -m tools.meta_signal ENVIRONMENT EPISODES SEEDS [CONFIG ...]
 
 Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and prints, for each third of
 training: the signal-to-noise ratio per update of each objective, mean over standard deviation over
@@ -9,8 +9,8 @@ little more β really does to the policy's weights, by finite differences throug
 `docs/method.md` explains the objectives.
 """
 
+import argparse
 import copy
-import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -139,8 +139,15 @@ def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> No
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 4:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.meta_signal DeepSea10-v0 3000 4 config/exploration.yaml",
+    )
+    parser.add_argument("environment")
+    parser.add_argument("episodes", type=int)
+    parser.add_argument("seeds", type=int, help="how many, from 1000")
+    parser.add_argument("configs", nargs="*", help="files over config.yaml")
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     with threadpool_limits(1):
-        main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
+        main(arguments.environment, arguments.episodes, arguments.seeds, arguments.configs)

@@ -35,7 +35,9 @@ def printed(command: str) -> str:
 
 def main() -> None:
     """Entry point; exits with 1 if a page says something else and --check is given."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.printed --check"
+    )
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check
     stale, marks = [], 0

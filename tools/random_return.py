@@ -1,9 +1,9 @@
 """Measure the mean return of uniformly random actions, for `metrics.random_return` in config.yaml.
 
-.venv/bin/python tools/random_return.py ENVIRONMENT EPISODES
+.venv/bin/python -m tools.random_return ENVIRONMENT EPISODES
 """
 
-import sys
+import argparse
 
 import gymnasium
 import numpy as np
@@ -29,8 +29,13 @@ def random_returns(name: str, episodes: int) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        sys.exit(__doc__)
-    measured = random_returns(sys.argv[1], int(sys.argv[2]))
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.random_return CartPole-v1 2000",
+    )
+    parser.add_argument("environment", help="its Gymnasium id")
+    parser.add_argument("episodes", type=int)
+    arguments = parser.parse_args()
+    measured = random_returns(arguments.environment, arguments.episodes)
     error = measured.std(ddof=1) / np.sqrt(len(measured))
-    print(f"{sys.argv[1]}: {measured.mean():.4g} (standard error {error:.2g})")
+    print(f"{arguments.environment}: {measured.mean():.4g} (standard error {error:.2g})")

@@ -17,6 +17,7 @@ FOLDER is one of reference/tables, or the results of any study. WHAT is one of
     readings    Table 1 under every reading                                         (readings.md)
 """
 
+import argparse
 import json
 import sys
 from collections import Counter
@@ -241,10 +242,17 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
 
 def main() -> None:
     """Entry point; exits with what is wrong with the arguments."""
-    if len(sys.argv) < 3 or sys.argv[1] not in SHOWN:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: python -m tools.show means reference/tables/study",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=SHOWN, metavar="WHAT")
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("more", nargs="*", metavar="...")
+    arguments = parser.parse_args()
     try:
-        lines = SHOWN[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])
+        lines = SHOWN[arguments.what](arguments.folder, *arguments.more)
     except OSError as error:
         sys.exit(f"show: {error.filename}: {error.strerror}")
     print("\n".join(lines))

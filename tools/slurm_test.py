@@ -12,6 +12,7 @@ SLURM_* variables on. That place is outside the project and needs root; all else
 its own. A machine that has a configuration there is refused.
 """
 
+import argparse
 import json
 import os
 import re
@@ -275,6 +276,9 @@ def contents(results: Path) -> dict[str, bytes]:
 
 def main() -> None:
     """Run everything; exit with 1 unless all is equal and every mishap happened and was mended."""
+    argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.slurm_test"
+    ).parse_args()
     require()
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda number, _: sys.exit(128 + number))

@@ -53,14 +53,7 @@ def parser() -> argparse.ArgumentParser:
         description="Play episodes with a trained agent and print its returns.",
         epilog="example: mace-rl evaluate cartpole_run --episodes 20 --deterministic",
     )
-    evaluate.add_argument("folder", type=Path, help="of a finished run")
-    evaluate.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
-    evaluate.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    evaluate.add_argument(
-        "--deterministic",
-        action="store_true",
-        help="take the most probable action, or the mean, instead of a sample",
-    )
+    _play(evaluate, episodes=100)
     watch = commands.add_parser(
         "watch",
         allow_abbrev=False,
@@ -68,14 +61,7 @@ def parser() -> argparse.ArgumentParser:
         description="Write an animated GIF of the first episodes that `mace-rl evaluate` plays.",
         epilog="example: mace-rl watch cartpole_run --out cartpole.gif",
     )
-    watch.add_argument("folder", type=Path, help="of a finished run")
-    watch.add_argument("--episodes", type=int, default=1, help="how many (default: 1)")
-    watch.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    watch.add_argument(
-        "--deterministic",
-        action="store_true",
-        help="take the most probable action, or the mean, instead of a sample",
-    )
+    _play(watch, episodes=1)
     watch.add_argument(
         "--untrained", action="store_true", help="film the agent as it was before training"
     )
@@ -159,12 +145,30 @@ def train(arguments: argparse.Namespace) -> None:
     logger.info("finished: %s", arguments.out / files.EPISODES)
 
 
+def _play(parser: argparse.ArgumentParser, episodes: int) -> None:
+    """The arguments of what plays episodes with a trained agent, `episodes` by default."""
+    parser.add_argument("folder", type=Path, help="of a finished run")
+    parser.add_argument(
+        "--episodes", type=int, default=episodes, help=f"how many (default: {episodes})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument(
+        "--deterministic",
+        action="store_true",
+        help="take the most probable action, or the mean, instead of a sample",
+    )
+
+
+def _require_playable(arguments: argparse.Namespace) -> None:
+    if arguments.episodes < 1 or arguments.seed < 0:
+        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+
+
 def evaluate(arguments: argparse.Namespace) -> None:
     """`mace-rl evaluate`."""
     from mace_rl.runs import evaluate
 
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+    _require_playable(arguments)
     returns = evaluate.evaluate(
         arguments.folder, arguments.episodes, arguments.seed, arguments.deterministic
     )
@@ -176,8 +180,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def watch(arguments: argparse.Namespace) -> None:
     """`mace-rl watch`."""
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+    _require_playable(arguments)
     if not (arguments.seconds > 0 and 50 <= arguments.width <= 2000):
         raise ConfigError("--seconds should be greater than 0 and --width from 50 to 2000")
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"

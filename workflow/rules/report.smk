@@ -39,11 +39,8 @@ rule page:
         colours=study.colours,
         command=COMMAND,
         configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
-        given={key: value for key, value in given.items() if key != "results"},
-        ppo={
-            env: study.run_config(env, study.variants[0], 0).ppo.model_dump()
-            for env in study.environments
-        },
+        given=GIVEN,
+        ppo=ppo_settings(),
         needs=lambda wildcards: what_needs_what(),
         template=provenance.file_digest(PACKAGE / "report" / "page.html"),
         code=code("report.py", MEASURED),

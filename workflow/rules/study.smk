@@ -1,5 +1,6 @@
 # The study as the configuration describes it, checked, and what all rules share of it.
 
+import json
 import os
 import re
 import shlex
@@ -46,8 +47,14 @@ TESTS_CLAIMS = (
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
 # Pictures of every run at once; one of the regret only where the configuration asks for it.
 PICTURES = ["every_seed", "profiles", *(["regret"] if study.metrics.regret else [])]
-# How the study is carried out, for what tells where it comes from.
-COMMAND = " ".join(["snakemake all", *(["--configfile", *config_files[1:]] if paths[1:] else [])])
+# How the study is carried out, for what tells where it comes from. Where its results are is no part.
+GIVEN = {key: value for key, value in given.items() if key != "results"}
+COMMAND = ["snakemake", "all"]
+COMMAND += ["--configfile", *config_files[1:]] if config_files[1:] else []
+COMMAND += (
+    ["--config", *(f"{key}={json.dumps(value)}" for key, value in GIVEN.items())] if GIVEN else []
+)
+COMMAND = shlex.join(COMMAND)
 BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
 
 
@@ -65,6 +72,17 @@ wildcard_constraints:
 def run_config(wildcards):
     """All that determines a run besides the code."""
     return study.run_config(wildcards.env, wildcards.variant, int(wildcards.seed))
+
+
+def ppo_settings():
+    """PPO's settings in each environment, and of the variants in it that have others."""
+    found = {}
+    for env in study.environments:
+        own = {name: study.run_config(env, name, 0).ppo.model_dump() for name in study.variants}
+        found[env] = own[study.variants[0]]
+        others = {name: settings for name, settings in own.items() if settings != found[env]}
+        found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
+    return found
 
 
 def most_work(wildcards):

@@ -62,10 +62,7 @@ rule table2:
     log:
         f"{RESULTS}/logs/table2.log",
     params:
-        ppo={
-            env: study.run_config(env, study.variants[0], 0).ppo.model_dump()
-            for env in study.environments
-        },
+        ppo=ppo_settings(),
         code=code("table2.py"),
     script:
         "../scripts/table2.py"

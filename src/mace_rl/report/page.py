@@ -18,7 +18,7 @@ from matplotlib.colors import to_hex
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.report.animations import Animations
-from mace_rl.report.panels import panels, svg
+from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST
 from mace_rl.results.figures import quantity
@@ -112,6 +112,7 @@ def page(
         environments=list(tables.metrics["env"].unique()),
         labels=labels,
         colours={variant: to_hex(colour) for variant, colour in colours.items()},
+        page_colours=PAGE_COLOURS,
         figures={
             figure: panels(
                 tables.curves[figure],

@@ -59,8 +59,8 @@ def svg(figure: Figure, name: str, label: str) -> str:
     text = figure_as_svg(figure)
     text = text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
     text = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", text)
-    # A tenth of a point is a seventh of a pixel; long decimals are half the file.
-    text = re.sub(r"(-?\d+\.\d)\d+", r"\1", text)
+    # A tenth of a point is a seventh of a pixel; the long decimals of paths are half the file.
+    text = re.sub(r'(?<= d=")[^"]+', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), text)
     for colour, of_page in PAGE_COLOURS.items():
         text = text.replace(colour, of_page)
     return text

@@ -23,7 +23,9 @@ def scores(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         random = settings.random_return_in(str(environment))
         for metric in SCORED:
             part = runs[["env", "variant", "seed"]].assign(metric=metric)
-            part["score"] = (runs[metric] - random) / (runs[metric].max() - random)
+            best = runs[metric].max()
+            # Where no run beats random actions there is nothing to be shared out.
+            part["score"] = (runs[metric] - random) / (best - random) if best > random else 0.0
             parts.append(part)
     return pd.concat(parts, ignore_index=True)
 

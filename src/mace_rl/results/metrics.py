@@ -135,7 +135,7 @@ def convergence_steps(curve: LearningCurve) -> Episode:
 
     Our reading: the first episode, once the average has come threshold of the way from random to
     final, at which its slope is down to `convergence_slope` of the steepest so far. Of the readings
-    that tools/convergence_simulation.py compares it varies least between seeds.
+    that tools.convergence_simulation compares it varies least between seeds.
 
     Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
     """

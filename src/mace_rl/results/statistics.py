@@ -194,7 +194,7 @@ def percentiles(resampled: np.ndarray, confidence: float, seeds: int) -> np.ndar
 
     The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
     the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
-    a bootstrap over 10 seeds is too narrow otherwise (tools/coverage.py). With one seed, and where
+    a bootstrap over 10 seeds is too narrow otherwise (tools.coverage). With one seed, and where
     one of `resampled` is NaN, NaN.
     """
     if seeds == 1:

@@ -8,6 +8,7 @@ import fcntl
 import gc
 import json
 import logging
+import math
 import os
 import resource
 import time
@@ -35,7 +36,7 @@ logger = logging.getLogger(__name__)
 PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
 START_SHARE = 0.01  # of the episodes, which wait for their code to be compiled
 # A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
-CHECKPOINT_SECONDS = float(os.environ.get("MACE_RL_CHECKPOINT_SECONDS", "10"))
+CHECKPOINT_SECONDS, CHECKPOINT_VARIABLE = 10.0, "MACE_RL_CHECKPOINT_SECONDS"
 CHECKPOINT_COST = 0.01
 # A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
 LOCK_SECONDS = 5.0
@@ -71,14 +72,16 @@ def run(
         trainer = Trainer(config)
         gc.freeze()  # what is there stays: the collector need not look through it again
         identity = run_identity(config)
-        before, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
-        clock = Clock(started - before, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
+        before, saving, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
+        progress_seconds = OBSERVER_SECONDS if observe else PROGRESS_SECONDS
+        clock = Clock(started - before, progress_seconds, saving)
         observe = observe or partial(write_progress, directory)
 
         def save() -> None:
             state = {
                 "trainer": trainer.state_dict(),
                 "seconds": clock.elapsed(),
+                "checkpoint_seconds": clock.checkpoint_seconds,
                 "interruptions": interruptions,
                 "machine": provenance.machine(),
             }
@@ -93,7 +96,8 @@ def run(
                 with clock.saving():
                     save()
         if keep_checkpoint:
-            save()
+            with clock.saving():
+                save()
         write_results(directory, trainer, identity, clock, interruptions)
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
@@ -115,35 +119,37 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
 
 def resume(
     trainer: Trainer, path: Path, identity: dict[str, Any]
-) -> tuple[float, list[dict[str, Any]]]:
+) -> tuple[float, float, list[dict[str, Any]]]:
     """Continue from the checkpoint at `path`, if it is this run's.
 
-    Returns the seconds already spent, and for each interruption so far the episode after which the
-    run was continued and the machine that had done the part before.
+    Returns the seconds already spent, those of them on checkpoints, and for each interruption so
+    far the episode after which the run was continued and the machine that had done the part before.
     """
     if not path.exists():
-        return 0.0, []
+        return 0.0, 0.0, []
     try:
         state = checkpoint.load(path, identity)
     except checkpoint.CheckpointError as error:
         logger.warning("starting afresh: %s", error)
-        return 0.0, []
+        return 0.0, 0.0, []
     trainer.load_state_dict(state["trainer"])
     logger.info("resuming after episode %d", len(trainer.records))
     interruption = {"after_episode": len(trainer.records), "machine": state["machine"]}
-    return state["seconds"], [*state["interruptions"], interruption]
+    interruptions = [*state["interruptions"], interruption]
+    return state["seconds"], state["checkpoint_seconds"], interruptions
 
 
 class Clock:
     """Training time, and when progress and checkpoints are due; seconds."""
 
-    def __init__(self, start: float, progress_seconds: float) -> None:
+    def __init__(self, start: float, progress_seconds: float, spent: float = 0.0) -> None:
         self.start = start
         self.start_seconds = 0.0  # of this process until its first episodes were over
         self.progress_seconds = progress_seconds
         self.next_progress = time.monotonic()
-        self.next_checkpoint = time.monotonic() + CHECKPOINT_SECONDS
-        self.checkpoint_seconds = 0.0  # spent on checkpoints in this process
+        self.between_checkpoints = between_checkpoints()
+        self.next_checkpoint = time.monotonic() + self.between_checkpoints
+        self.checkpoint_seconds = spent  # on checkpoints
 
     def elapsed(self) -> float:
         """Seconds of this run, those before interruptions included."""
@@ -168,7 +174,19 @@ class Clock:
         yield
         cost = time.monotonic() - start
         self.checkpoint_seconds += cost
-        self.next_checkpoint = start + max(CHECKPOINT_SECONDS, cost / CHECKPOINT_COST)
+        self.next_checkpoint = start + max(self.between_checkpoints, cost / CHECKPOINT_COST)
+
+
+def between_checkpoints() -> float:
+    """Seconds, as MACE_RL_CHECKPOINT_SECONDS says if it is set; `RunError` for what cannot be."""
+    said = os.environ.get(CHECKPOINT_VARIABLE)
+    try:
+        seconds = CHECKPOINT_SECONDS if said is None else float(said)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds < math.inf:
+        raise RunError(f"{CHECKPOINT_VARIABLE} is {said!r}, but should be a number of seconds")
+    return seconds
 
 
 @contextmanager
