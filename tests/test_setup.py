@@ -83,10 +83,8 @@ def test_whoever_installs_the_package_gets_its_types(tmp_path):
     subprocess.run([*command, "-w", "wheel", "."], cwd=tmp_path, check=True)
     (wheel,) = (tmp_path / "wheel").iterdir()
     packed = set(zipfile.ZipFile(wheel).namelist())
-    files = (path for path in (ROOT / "src/mace_rl").rglob("*") if path.is_file())
-    wanted = {
-        str(path.relative_to(ROOT / "src")) for path in files if "__pycache__" not in path.parts
-    }
+    found = [path.relative_to(ROOT / "src") for path in (ROOT / "src/mace_rl").rglob("*.*")]
+    wanted = {str(path) for path in found if "__pycache__" not in path.parts}
     assert "mace_rl/report/page.html" in wanted and wanted <= packed
 
 
