@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from mace_rl import arithmetic
-from mace_rl.arithmetic import EXPECTED, PORTABLE, VARIABLE
+from mace_rl.arithmetic import EXPECTED, PORTABLE, VARIABLE, UnfitArithmeticError
 
 REPORT = (
     "import mace_rl, json, numpy, scipy.linalg, numba.core.registry, torch\n"
@@ -75,7 +75,7 @@ def test_a_processor_without_avx2_gets_one_line_and_a_way_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(arithmetic.binding, "get_host_cpu_features", lambda: {"avx2": False})
-    with pytest.raises(ArithmeticError, match=r"AVX2 and FMA.*MACE_RL_ARITHMETIC=native"):
+    with pytest.raises(UnfitArithmeticError, match=r"AVX2 and FMA.*MACE_RL_ARITHMETIC=native"):
         arithmetic.require()
     for name in PORTABLE:
         monkeypatch.delenv(name, raising=False)
@@ -85,5 +85,5 @@ def test_a_processor_without_avx2_gets_one_line_and_a_way_out(
 
 def test_a_mistake_in_the_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "natve")
-    with pytest.raises(ArithmeticError, match="is 'natve', but should be portable or native"):
+    with pytest.raises(UnfitArithmeticError, match="is 'natve', but should be portable or native"):
         arithmetic.require()

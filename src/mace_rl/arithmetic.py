@@ -13,6 +13,8 @@ import sys
 from llvmlite import binding
 from threadpoolctl import threadpool_info
 
+from mace_rl.refusal import Refusal
+
 VARIABLE = "MACE_RL_ARITHMETIC"  # portable (default) or native
 
 # What the libraries read, and `in_use` finds, when arithmetic is portable.
@@ -29,11 +31,15 @@ EXPECTED = {"blas": "Haswell", "numpy": "X86_V3", "numba": "haswell", "torch": "
 NEEDED = ("avx2", "fma")
 
 
+class UnfitArithmeticError(Refusal):
+    """What computes is not what was chosen, or cannot be; the message says why."""
+
+
 def chosen() -> str:
-    """`portable` or `native`, as `MACE_RL_ARITHMETIC` says; `ArithmeticError` for all else."""
+    """`portable` or `native`, as `MACE_RL_ARITHMETIC` says; `UnfitArithmeticError` for all else."""
     choice = os.environ.get(VARIABLE, "portable")
     if choice not in ("portable", "native"):
-        raise ArithmeticError(f"{VARIABLE} is {choice!r}, but should be portable or native")
+        raise UnfitArithmeticError(f"{VARIABLE} is {choice!r}, but should be portable or native")
     return choice
 
 
@@ -88,18 +94,18 @@ def in_use() -> dict[str, str]:
 
 
 def require() -> None:
-    """Raise `ArithmeticError` if arithmetic should be portable, and what is in use is not."""
+    """Raise `UnfitArithmeticError` if arithmetic should be portable, and what is in use is not."""
     if chosen() == "native":
         return
     way_out = f"{VARIABLE}=native trains with whatever there is; its results are its own"
     if not processor_suffices():
-        raise ArithmeticError(
+        raise UnfitArithmeticError(
             "portable arithmetic needs an x86-64 processor with AVX2 and FMA, which this is not; "
             + way_out
         )
     for library, found in in_use().items():
         if found != EXPECTED.get(library, found):
-            raise ArithmeticError(
+            raise UnfitArithmeticError(
                 f"arithmetic is not portable: {library} computes with {found}, not "
                 f"{EXPECTED[library]}, because it was loaded before mace_rl; import mace_rl "
                 f"first. {way_out}"

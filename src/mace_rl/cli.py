@@ -9,6 +9,7 @@ from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import read_study
+from mace_rl.refusal import Refusal
 from mace_rl.runs.provenance import read_record
 
 logger = logging.getLogger(__name__)
@@ -239,7 +240,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         commands[arguments.command](arguments)
-    except (ValueError, RuntimeError, ArithmeticError, OSError) as error:
+    except (Refusal, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         logger.info("interrupted; the same command resumes it")

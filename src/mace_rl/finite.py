@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from mace_rl.refusal import Refusal
 
-class NonFiniteError(ArithmeticError):
+
+class NonFiniteError(Refusal, ArithmeticError):
     """NaN, Inf or a number out of its range; the message says in what, and where in the run."""
 
 

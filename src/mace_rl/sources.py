@@ -13,11 +13,13 @@ from functools import cache
 from pathlib import Path
 from typing import TypeGuard
 
+from mace_rl.refusal import Refusal
+
 PACKAGE = Path(__file__).parent
 NAME = PACKAGE.name  # mace_rl
 
 
-class SourceError(ImportError):
+class SourceError(Refusal, ImportError):
     """An import that cannot be followed; the message names the file and the line."""
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 import numpy as np
 
 from mace_rl.files import write_atomically
+from mace_rl.refusal import Refusal
 
 if TYPE_CHECKING:  # pandas is imported where a frame is built: training only writes
     import pandas as pd
@@ -77,7 +78,7 @@ def as_rows(kind: type[Row], columns: Mapping[str, np.ndarray]) -> list[Row]:
 _BOUND = {int: 2**53, float: np.inf}  # of a number's size: an int is exact as a double
 
 
-class RecordError(ValueError):
+class RecordError(Refusal, ValueError):
     """A result file that cannot be trusted; the message names the file and the line."""
 
 

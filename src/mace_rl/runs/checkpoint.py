@@ -12,9 +12,10 @@ from typing import Any
 import torch
 
 from mace_rl.files import write_atomically
+from mace_rl.refusal import Refusal
 
 
-class CheckpointError(ValueError):
+class CheckpointError(Refusal, ValueError):
     """A file that is damaged or belongs to another run; the message names it and says why."""
 
 

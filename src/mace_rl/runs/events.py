@@ -12,6 +12,7 @@ import numpy as np
 
 from mace_rl import files
 from mace_rl.files import write_atomically
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import RecordError
 from mace_rl.runs import checkpoint
 from mace_rl.runs.provenance import file_digest, read_record
@@ -22,7 +23,7 @@ Table = Mapping[str, np.ndarray]  # columns, [rows]
 Row = tuple[int, dict[str, float]]  # the episode, and each tag's value
 
 
-class EventsError(RuntimeError):
+class EventsError(Refusal, RuntimeError):
     """Events that cannot be written; the message says why."""
 
 

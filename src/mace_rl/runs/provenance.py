@@ -9,6 +9,8 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from mace_rl.refusal import Refusal
+
 PACKAGE = Path(__file__).parents[1]
 
 # The packages whose version can change a result.
@@ -26,7 +28,7 @@ PACKAGES = (
 KEYS = {"config", "versions", "arithmetic", "sources", "machine", "outputs"}
 
 
-class ProvenanceError(ValueError):
+class ProvenanceError(Refusal, ValueError):
     """A `run.json` that cannot be trusted; the message names it."""
 
 

@@ -26,6 +26,7 @@ from mace_rl import arithmetic, files, sources
 from mace_rl.config.plugins import source_file
 from mace_rl.config.run import RunConfig
 from mace_rl.files import write_atomically
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
@@ -42,7 +43,7 @@ CHECKPOINT_COST = 0.01
 LOCK_SECONDS = 5.0
 
 
-class RunError(RuntimeError):
+class RunError(Refusal, RuntimeError):
     """A run that cannot be carried out in its folder; the message says why."""
 
 
@@ -59,8 +60,8 @@ def run(
     Continues from its checkpoint if there is one of this very configuration, code and versions;
     otherwise says so in the log and starts afresh. With `keep_checkpoint` a last one stays, from
     which results that are deleted come back without training. Uses one thread. Raises `RunError`
-    if another process is at work in `directory`, and `ArithmeticError` if arithmetic is not what
-    was chosen.
+    if another process is at work in `directory`, and `UnfitArithmeticError` if arithmetic is not
+    what was chosen.
     """
     arithmetic.require()
     torch.set_num_threads(1)

@@ -15,10 +15,15 @@ import numpy as np
 from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import RecordError, read_episodes
 from mace_rl.results.statistics import paired_comparison
 from mace_rl.runs.checkpoint import difference
 from mace_rl.runs.provenance import file_digest, read_record
+
+
+class NotReproducedError(Refusal):
+    """A repeated run differs more than another machine explains."""
 
 
 class Repetition(NamedTuple):
@@ -114,7 +119,7 @@ def verdict(results: Sequence[Repetition], confidence: float) -> tuple[bool, str
 def verify(folder: Path, sample: int | None, seed: int, confidence: float) -> Iterator[str]:
     """Repeat `sample` runs of `folder` (None: all), chosen with `seed`; yields lines to show.
 
-    The last line is the verdict. Raises `RecordError` for damaged files and `ArithmeticError` if
+    The last line is the verdict. Raises `RecordError` for damaged files and `NotReproducedError` if
     the runs are not reproduced.
     """
     runs = reference_runs(folder)
@@ -127,5 +132,5 @@ def verify(folder: Path, sample: int | None, seed: int, confidence: float) -> It
         yield describe(results[-1])
     reproduced, line = verdict(results, confidence)
     if not reproduced:
-        raise ArithmeticError(f"not reproduced: {line}")
+        raise NotReproducedError(f"not reproduced: {line}")
     yield line
