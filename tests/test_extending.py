@@ -77,6 +77,9 @@ def test_edit_of_the_user_s_file_makes_it_another_run(folder):
     before = json.loads(record.read_text(encoding="utf-8"))["sources"]
     file = folder / "linear_decay.py"
     file.write_text(file.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
+    refused = mace_rl(folder, command)
+    assert refused.returncode == 1
+    assert "linear_decay holds a finished run of other code, in linear_decay:" in refused.stderr
     record.unlink()
     assert mace_rl(folder, command).returncode == 0
     assert json.loads(record.read_text(encoding="utf-8"))["sources"] != before

@@ -10,7 +10,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import read_study
 from mace_rl.refusal import Refusal
-from mace_rl.runs.provenance import read_record
+from mace_rl.runs.provenance import read_record, sources_of
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ def finished(config: RunConfig, directory: Path) -> bool:
     record = directory / files.RECORD
     if not record.exists():
         return False
-    found = check(RunConfig, read_record(record)["config"], str(record)).settings()
+    content = read_record(record)
+    found = check(RunConfig, content["config"], str(record)).settings()
     wanted = config.settings()
     different = [key for key in wanted | found if found.get(key) != wanted.get(key)]
     if different:
@@ -127,6 +128,12 @@ def finished(config: RunConfig, directory: Path) -> bool:
         raise ConfigError(
             f"{directory} holds a finished run whose {key} is {found.get(key)!r}, "
             f"not {wanted.get(key)!r}; choose another --out"
+        )
+    own = config.references()
+    if own and content["sources"] != sources_of(config):
+        raise ConfigError(
+            f"{directory} holds a finished run of other code, in {', '.join(own.values())} or"
+            " mace_rl; choose another --out"
         )
     return True
 

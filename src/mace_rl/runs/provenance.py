@@ -9,6 +9,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from mace_rl import sources
+from mace_rl.config.plugins import source_file
+from mace_rl.config.run import RunConfig
 from mace_rl.refusal import Refusal
 
 PACKAGE = Path(__file__).parents[1]
@@ -30,6 +33,14 @@ KEYS = {"config", "versions", "arithmetic", "sources", "machine", "outputs"}
 
 class ProvenanceError(Refusal, ValueError):
     """A `run.json` that cannot be trusted; the message names it."""
+
+
+def sources_of(config: RunConfig) -> str:
+    """The digest of all code that a run depends on, the user's own included."""
+    return sources.digest(
+        sources.PACKAGE / "runs" / "run.py",
+        *(source_file(reference, key) for key, reference in config.references().items()),
+    )
 
 
 def file_digest(path: Path) -> str:

@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from mace_rl import arithmetic, files, sources
-from mace_rl.config.plugins import source_file
+from mace_rl import arithmetic, files
 from mace_rl.config.run import RunConfig
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
@@ -111,10 +110,7 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
         "config": config.settings(),
         "versions": provenance.versions(),
         "arithmetic": arithmetic.in_use(),
-        "sources": sources.digest(
-            sources.PACKAGE / "runs" / "run.py",
-            *(source_file(reference, key) for key, reference in config.references().items()),
-        ),
+        "sources": provenance.sources_of(config),
     }
 
 
