@@ -36,7 +36,7 @@ test-quick: setup ## the tests that take seconds, for the edit loop
 	@$(PYTEST) -m "not slow"
 
 tables: setup ## every table, figure and verdict from the runs in reference/, without training
-	@$(IN_VENV) tools.tables
+	@$(IN_VENV) tools.tables $(if $(CI),--check)
 
 numbers: setup ## write what the tables of reference/ say into README and docs
 	@$(IN_VENV) tools.printed

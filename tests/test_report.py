@@ -30,6 +30,7 @@ from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
+from tools.tables import RULES
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "config.yaml"
@@ -38,9 +39,6 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 needs_browser = pytest.mark.skipif(
     BROWSER is None and "CI" not in os.environ, reason="needs chromium (Debian: apt install)"
 )
-# All but training, which is done here in one process.
-RULES = ["metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure"]
-RULES += ["pictures", "readings", "claims", "page"]
 SECTIONS = ["verdicts", "learning", "table1", "agents", "beta"]
 SECTIONS += ["ranking", "statistics", "ledger", "costs", "workflow", "configuration"]
 MOST_BYTES = 25_000_000

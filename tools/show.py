@@ -28,9 +28,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from mace_rl.config.reading import read_yaml
+from mace_rl.config.results import MetricsConfig
 from mace_rl.results.claims import LITERAL, ROBUST
 from mace_rl.results.statistics import mean_interval
 
+ROOT = Path(__file__).resolve().parent.parent
+SETTINGS = MetricsConfig.model_validate(read_yaml(ROOT / "config.yaml")["metrics"])
 SOLVED = 0.9  # of the last episodes, for a seed to count
 AREA = "area_under_curve"
 
@@ -214,7 +218,10 @@ def _columns(folder: Path, cell: Callable[[pd.DataFrame], str]) -> list[str]:
 def _mean(values: pd.Series) -> str:
     """A mean over seeds with the interval of the tables."""
     numbers = values.to_numpy(np.float64)
-    low, high = mean_interval(numbers, 0.95, 10_000, np.random.default_rng(0))
+    generator = np.random.default_rng(SETTINGS.bootstrap_seed)
+    low, high = mean_interval(
+        numbers, SETTINGS.confidence, SETTINGS.bootstrap_repetitions, generator
+    )
     return f"{_short(numbers.mean())} ({_short(float(low))} to {_short(float(high))})"
 
 

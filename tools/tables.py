@@ -79,7 +79,7 @@ def main() -> None:
         make(only, {**studies[only], "outputs": [PAGE]})
         print(MADE / only / PAGE)
         return
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(make, studies, studies.values()))
     outputs = {name: study["outputs"] for name, study in studies.items()}
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
