@@ -30,7 +30,7 @@ import pandas as pd
 
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.claims import LITERAL, ROBUST
+from mace_rl.results.claims import LITERAL, ROBUST, digits_of
 from mace_rl.results.statistics import mean_interval
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -85,9 +85,9 @@ def parts(folder: Path, how: str = ROBUST) -> list[str]:
     ]
     for claim in _claims(folder)["claims"]:
         for part in claim[how]["parts"]:
-            digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
             low, mean, high, detectable = (
-                _number(part[name], digits) for name in ("low", "difference", "high", "detectable")
+                _number(part[name], digits_of(part))
+                for name in ("low", "difference", "high", "detectable")
             )
             cells = [
                 claim["claim"],

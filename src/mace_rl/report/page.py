@@ -20,14 +20,14 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.report.animations import Animations
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
-from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST
+from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, digits_of
 from mace_rl.results.figures import quantity
 from mace_rl.results.metrics import all_metrics, read_metrics
 from mace_rl.results.paper import PAPER_METRICS
 from mace_rl.results.pictures import draw_every_seed, draw_profiles, draw_regret
 from mace_rl.results.readings import draw_readings, in_order, ranked, title
 from mace_rl.results.records import RunKey
-from mace_rl.results.tables import DIGITS
+from mace_rl.results.tables import DIGITS, from_to
 
 TEMPLATE = Path(__file__).with_name("page.html")
 FIGURES = ("1", "2")
@@ -106,7 +106,7 @@ def page(
         few=int(seeds.min()) if seeds.min() < FEWEST_SEEDS else None,
         fewest=FEWEST_SEEDS,
         power=POWER,
-        seeds=_from_to(seeds),
+        seeds=from_to(seeds),
         confidence=f"{100 * settings.confidence:g} %",
         window=settings.moving_average,
         environments=list(tables.metrics["env"].unique()),
@@ -173,11 +173,6 @@ def _value(value: Any) -> str:
             return str(value)
 
 
-def _from_to(counts: "pd.Series[int]") -> str:
-    low, high = counts.min(), counts.max()
-    return str(low) if low == high else f"{low} to {high}"
-
-
 def _claims(ledger: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """The ledger with numbers as they are printed."""
     claims = []
@@ -194,9 +189,8 @@ def _claims(ledger: Mapping[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def _part(part: Mapping[str, Any]) -> dict[str, Any]:
-    digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
     names = ("difference", "low", "high", "detectable")
-    shown: dict[str, Any] = {name: number(part[name], digits) for name in names}
+    shown: dict[str, Any] = {name: number(part[name], digits_of(part)) for name in names}
     return dict(part) | shown | {"environments": ", ".join(part["environments"])}
 
 

@@ -330,9 +330,14 @@ def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def digits_of(part: Mapping[str, Any]) -> int:
+    """How many digits after the point the numbers of a part are shown with."""
+    return {"episodes": 0, "return": 1}.get(part["unit"], 3)
+
+
 def _row(part: Mapping[str, Any]) -> str:
     """One part, as cells."""
-    digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+    digits = digits_of(part)
     difference, low, high, detectable = (
         f"{part[name]:.{digits}f}" for name in ("difference", "low", "high", "detectable")
     )

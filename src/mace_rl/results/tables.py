@@ -295,7 +295,7 @@ def _interval(row: Any, digits: int = 0) -> str:
 def _how(table: pd.DataFrame, confidence: float) -> str:
     """The part of a caption that says from what the numbers come."""
     seeds = table["seeds"].min()
-    count = _from_to(table["seeds"])
+    count = from_to(table["seeds"])
     budgets: dict[str, list[str]] = {}
     for environment, group in table.groupby("env", sort=False):
         budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
@@ -320,7 +320,7 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     return text
 
 
-def _from_to(counts: pd.Series) -> str:
+def from_to(counts: pd.Series) -> str:
     """A number, or from which to which."""
     low, high = counts.min(), counts.max()
     return str(low) if low == high else f"{low} to {high}"
