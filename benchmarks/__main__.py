@@ -6,7 +6,7 @@ from importlib import import_module
 
 from benchmarks.settings import FULL, QUICK
 
-PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "report")
+PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "purejaxrl", "report")
 
 
 def main() -> None:
