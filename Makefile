@@ -44,7 +44,7 @@ numbers: setup ## write what the tables of reference/ say into README and docs
 report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)
 
-bench: setup ## speed and memory beside stable-baselines3 (40 minutes; BENCH=quick: a few)
+bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour; BENCH=quick: a few)
 	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)
 
 verify: setup ## repeat a sample of the runs in reference/ and compare to the bit (SAMPLE=3)
@@ -156,8 +156,8 @@ audit: ## known vulnerabilities of what the locks pin (asks a vulnerability serv
 	"$$folder/bin/python" -m pip_audit --strict --require-hashes --disable-pip \
 	    --progress-spinner=off -r environment.lock -r environment-cuda.lock
 
-clean: ## remove .venv and caches; never results/ or Snakemake's records
-	@rm -rf .venv setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+clean: ## remove the environments and caches; never results/ or Snakemake's records
+	@rm -rf .venv .venv-purejaxrl setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
 
 help: ## this list

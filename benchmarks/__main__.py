@@ -6,7 +6,8 @@ from importlib import import_module
 
 from benchmarks.settings import FULL, QUICK
 
-PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "report")
+PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "purejaxrl", "arithmetic")
+PARTS += ("report",)
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from mace_rl import arithmetic
 
 CONTESTANTS = ("ppo", "mace_full")
 KINDS = ("portable", "native")
+LIBRARIES = ("blas", "numpy", "numba", "torch")  # of `arithmetic.in_use`
 
 
 def measure_all(scale: Scale) -> None:

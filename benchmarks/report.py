@@ -10,7 +10,7 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from benchmarks import start, wrapper
+from benchmarks import arithmetic, purejaxrl, start, wrapper
 from benchmarks.breakdown import ALL_SECTIONS
 from benchmarks.settings import (
     ACROBOT,
@@ -49,8 +49,8 @@ RATIOS = (
 def measure_all(scale: Scale) -> None:
     """Write the document and the pictures of the data in `scale.data`, and summary.csv."""
     names = ("results", "breakdown", "growth", "workflow", "planning", "start", "wrapper")
-    data = [pd.read_csv(scale.data / f"{name}.csv") for name in names]
-    results, times, growth, jobs, planning, starts, costs = data
+    data = [pd.read_csv(scale.data / f"{name}.csv") for name in (*names, "purejaxrl", "arithmetic")]
+    results, times, growth, jobs, planning, starts, costs, peers, prices = data
     summary = speed_summary(results)
     summary.to_csv(scale.data / "summary.csv", index=False)
     draw_speed(summary, scale)
@@ -68,6 +68,8 @@ def measure_all(scale: Scale) -> None:
         "workflow": workflow_table(study, plan),
         "start": start_table(starts),
         "wrapper": wrapper.table(costs),
+        "purejaxrl": purejaxrl_tables(peers),
+        "arithmetic": arithmetic_table(prices),
     }
     text = filled((ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), tables)
     scale.document.write_text(text, encoding="utf-8")
@@ -236,7 +238,11 @@ def goals(
     return markdown(pd.DataFrame(rows, columns=columns))
 
 
-def speed_table(summary: pd.DataFrame) -> str:
+def speed_table(
+    summary: pd.DataFrame,
+    labels: dict[str, str] = LABELS,
+    name: str = "environment steps per second",
+) -> str:
     """Median, range and ratio of every contestant; a second row for a later reading."""
     rows = summary.sort_values("target_steps")
     rows["reading"] = rows.groupby(["env", "contestant"]).cumcount()
@@ -246,9 +252,9 @@ def speed_table(summary: pd.DataFrame) -> str:
         for row in rows.itertuples()
     ]
     table = rows.pivot(index=["contestant", "reading"], columns="env", values="cell").fillna("–")
-    table = table.reindex(LABELS, level=0)
-    table.index = [LABELS[name] if n == 0 else "… later in training" for name, n in table.index]
-    return by_environment("environment steps per second", table, "")
+    table = table.reindex(labels, level=0)
+    table.index = [labels[who] if n == 0 else "… later in training" for who, n in table.index]
+    return by_environment(name, table, "")
 
 
 def steps_table(summary: pd.DataFrame) -> str:
@@ -266,8 +272,9 @@ def memory_table(jobs: pd.DataFrame) -> str:
 
 def by_environment(name: str, table: pd.DataFrame, form: str) -> str:
     """`table`, whose columns are environments and whose index is called `name`."""
-    cells = table[list(ENVIRONMENTS)].map(lambda value: format(value, form))
-    return markdown(cells.reset_index(names=name), ENVIRONMENTS)
+    there = [environment for environment in ENVIRONMENTS if environment in table]
+    cells = table[there].map(lambda value: format(value, form))
+    return markdown(cells.reset_index(names=name), there)
 
 
 def breakdown_table(times: pd.DataFrame) -> str:
@@ -321,6 +328,43 @@ def start_table(starts: pd.DataFrame) -> str:
     ]
     found = pd.DataFrame(rows, index=list(columns.values())).T
     return markdown(found.reset_index(names="start and end of a run"), list(columns.values()))
+
+
+def purejaxrl_tables(rows: pd.DataFrame) -> str:
+    """Steps per CPU second of everybody, ours relative to PureJaxRL's, what ran; or why nothing."""
+    if "left_out" in rows:
+        return f"PureJaxRL was left out: {rows['left_out'][0]}"
+    rows = rows.assign(steps_per_second=rows["steps"] / rows["cpu_seconds"])
+    labels = {name: LABELS[name] for name in purejaxrl.OTHERS} | purejaxrl.LABELS
+    speeds = speed_table(speed_summary(rows), labels, "environment steps per CPU second")
+    rate, ratios = rates(rows)["first"], []
+    for environment in purejaxrl.ENVIRONMENTS:
+        for ours in [name for name in purejaxrl.OTHERS if name in OURS]:
+            found = (rate[environment, ours] / rate[environment, its] for its in purejaxrl.LABELS)
+            cells = [median_and_range(ratio, ".2f") for ratio in found]
+            ratios.append([f"{labels[ours]}, {environment}", *cells])
+    against = [f"÷ {label}" for label in purejaxrl.LABELS.values()]
+    columns = ["ratio of steps per CPU second", *against]
+    relative = markdown(pd.DataFrame(ratios, columns=columns), against)
+    its_versions = rows.set_index("contestant")["versions"][list(purejaxrl.LABELS)].iloc[0]
+    return f"{speeds}\n\n{relative}\n\n{machine(rows)} {its_versions}."
+
+
+def arithmetic_table(rows: pd.DataFrame) -> str:
+    """Steps per CPU second with portable arithmetic and with native, their ratio, what ran."""
+    lines = []
+    for (environment, contestant), own in rows.groupby(["env", "contestant"], sort=False):
+        rate = own.pivot(index="seed", columns="arithmetic", values="steps_per_cpu_second")
+        cells = [median_and_range(rate[kind], ",.0f") for kind in arithmetic.KINDS]
+        ratio = median_and_range(rate["portable"] / rate["native"], ".2f")
+        lines.append([f"{contestant}, {environment}", *cells, ratio, len(rate)])
+    columns = [*arithmetic.KINDS, "portable ÷ native", "repeats"]
+    table = pd.DataFrame(lines, columns=["steps per CPU second", *columns])
+    used = [
+        f"{kind}: {', '.join(f'{name} {own[name].iloc[0]}' for name in arithmetic.LIBRARIES)}"
+        for kind, own in rows.groupby("arithmetic", sort=False)
+    ]
+    return f"{markdown(table, columns)}\n\n{'; '.join(used)}."
 
 
 def median_and_range(values: pd.Series, form: str) -> str:

@@ -49,6 +49,7 @@ class Scale:
     start_repeats: int
     start_jobs: int  # of the workflow whose jobs do nothing but start and end
     planned_seeds: int  # of the workflow that is only planned, with every variant there is
+    purejaxrl_repeats: int
 
 
 FULL = Scale(
@@ -65,6 +66,7 @@ FULL = Scale(
     start_repeats=5,
     start_jobs=4,
     planned_seeds=200,
+    purejaxrl_repeats=3,
 )
 _QUICK = ROOT / "benchmarks" / "quick"
 QUICK = Scale(
@@ -81,4 +83,5 @@ QUICK = Scale(
     start_repeats=1,
     start_jobs=2,
     planned_seeds=20,
+    purejaxrl_repeats=1,
 )

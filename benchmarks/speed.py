@@ -6,7 +6,7 @@ done so far, whenever that is known. What happens before the first `next` is not
 
 import platform
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -30,28 +30,32 @@ def measure_all(scale: Scale) -> None:
     """Carry out all measurements and write results.csv, anew after each."""
     from mace_rl.runs.provenance import cpu_model
 
-    versions = [f"{name} {metadata.version(name)}" for name in PACKAGES.split()]
-    versions = ", ".join([f"python {platform.python_version()}", *versions])
     rows = []
-    for repeat, environment, contestant in schedule(scale.repeats):
+    everybody = {environment: contestants(environment) for environment in ENVIRONMENTS}
+    for repeat, environment, contestant in schedule(scale.repeats, everybody):
         stops = marks(scale, environment, contestant)
         seed = FIRST_SEED + repeat
         for reading in in_fresh_process(measure, contestant, environment, seed, stops):
             identity = {"env": environment, "contestant": contestant, "repeat": repeat}
-            rows.append(identity | reading | {"cpu": cpu_model(), "versions": versions})
+            rows.append(identity | reading | {"cpu": cpu_model(), "versions": versions()})
         write_rows(scale.data / "results.csv", rows)
         rate = rows[-1]["steps_per_second"]
         print(f"repeat {repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
 
 
-def schedule(repeats: int) -> Iterator[tuple[int, str, str]]:
+def versions() -> str:
+    """Of Python and of what everybody computes with."""
+    found = [f"{name} {metadata.version(name)}" for name in PACKAGES.split()]
+    return ", ".join([f"python {platform.python_version()}", *found])
+
+
+def schedule(repeats: int, everybody: Mapping[str, list[str]]) -> Iterator[tuple[int, str, str]]:
     """(repeat, environment, contestant), in turn; every repeat begins with another contestant.
 
     So whatever slows the machine down for a while, or warms it up, hits everybody.
     """
     for repeat in range(repeats):
-        for environment in ENVIRONMENTS:
-            names = contestants(environment)
+        for environment, names in everybody.items():
             first = repeat % len(names)
             for contestant in names[first:] + names[:first]:
                 yield repeat, environment, contestant

@@ -1,14 +1,28 @@
 """The benchmark: its arithmetic by hand-made numbers, and that it measures what it says."""
 
 import importlib
+import os
+import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import breakdown, growth, report, settings, speed, start, wrapper
-from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FULL, HOPPER, OURS, VARIANTS
+from benchmarks import (
+    arithmetic,
+    breakdown,
+    growth,
+    purejaxrl,
+    report,
+    settings,
+    speed,
+    start,
+    wrapper,
+)
+from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FULL, HOPPER, OURS, QUICK, VARIANTS
 
 
 def result(env, contestant, repeat, target, rate):
@@ -25,7 +39,8 @@ def data(tmp_path):
 
     Two repeats, the second twice as fast: the reference does 1000 and 2000 steps/s, ours ten times
     that and later 20 times. Four jobs of 5 s each on two cores, 3 s after the workflow's beginning
-    and 5 s before its end. A walk whose last tenth takes three times as long as its second.
+    and 5 s before its end. A walk whose last tenth takes three times as long as its second. In CPU
+    time PureJaxRL is half as fast as ours; the processor was there for a tenth of the time.
     """
     rows = [
         result(env, contestant, repeat, target, 1000 * (repeat + 1) * factor)
@@ -61,11 +76,51 @@ def data(tmp_path):
     index = pd.MultiIndex.from_product([wrapper.NAMES, wrapper.WHERE], names=["env", "where"])
     costs = [pd.DataFrame({wrapper.TIME: time}, index) for time in (1.0, 3.0)]
     pd.concat(costs).reset_index().to_csv(tmp_path / "wrapper.csv")
+    peers = [
+        result(env, contestant, repeat, 100, 1000 * (repeat + 1) * factor) | {"seconds": 1.0}
+        for repeat in range(2)
+        for env in purejaxrl.ENVIRONMENTS
+        for contestants, factor in (
+            (purejaxrl.OTHERS[:1], 1),
+            (purejaxrl.OTHERS[1:], 10),
+            (purejaxrl.ROLLOUTS, 5),
+        )
+        for contestant in contestants
+    ]
+    pd.DataFrame(peers).to_csv(tmp_path / "purejaxrl.csv")
+    prices = [
+        {"env": env, "contestant": contestant, "seed": 1000 + repeat, "arithmetic": kind}
+        | {"steps_per_cpu_second": 1000.0 * (repeat + 1) * factor}
+        | dict.fromkeys(arithmetic.LIBRARIES, kind.upper())
+        for repeat in range(2)
+        for env in ENVIRONMENTS
+        for contestant in arithmetic.CONTESTANTS
+        for kind, factor in zip(arithmetic.KINDS, (0.75, 1), strict=True)
+    ]
+    pd.DataFrame(prices).to_csv(tmp_path / "arithmetic.csv")
     return tmp_path
 
 
+def test_the_price_of_portable_arithmetic_is_taken_within_a_repeat(data):
+    table = report.arithmetic_table(pd.read_csv(data / "arithmetic.csv"))
+    assert "| ppo, CartPole-v1 | 1,125 (750 to 1,500) | 1,500 (1,000 to 2,000) |" in table
+    assert table.count("| 0.75 (0.75 to 0.75) | 2 |") == len(ENVIRONMENTS) * 2
+    assert "native: blas NATIVE" in table and "torch PORTABLE" in table
+
+
+@pytest.mark.slow
+def test_arithmetic_is_measured_as_it_is_asked_for(monkeypatch):
+    monkeypatch.setattr(speed, "WARM_UP_STEPS", 64)
+    for kind in arithmetic.KINDS:
+        row = arithmetic.with_arithmetic(kind, "ppo", CARTPOLE, 1000, 64)
+        assert row["arithmetic"] == kind and row["steps_per_cpu_second"] > 0
+        assert (row["numba"] == "haswell") or kind == "native"
+    assert os.environ["NUMBA_CPU_NAME"] == "haswell"
+
+
 def test_everything_is_measured_once_in_every_repeat_and_begins_with_another():
-    order = list(speed.schedule(5))
+    everybody = {environment: settings.contestants(environment) for environment in ENVIRONMENTS}
+    order = list(speed.schedule(5, everybody))
     expected = {(r, e, c) for r in range(5) for e in ENVIRONMENTS for c in settings.contestants(e)}
     assert (len(order), set(order)) == (len(expected), expected)
     assert [repeat for repeat, _, _ in order] == sorted(repeat for repeat, _, _ in order)
@@ -113,6 +168,8 @@ def test_report_is_written_from_the_data(data):
         "| job ÷ by hand | 1.50 (1.33 to 2.00) | 1.50 (1.33 to 2.00) |",
         "| planning (`snakemake -n`) of 3000 runs | 12 s |  | ≤ 60 s | ≤ 20 s |",
         f"| CartPole-v1 |{' 2.0 (1.0 to 3.0) |' * 5}",
+        f"| PureJaxRL PPO, 1 × 2048 |{' **7,500** (5,000 to 10,000) 5.0× |' * 2}\n\n",
+        f"| mace_full, Acrobot-v1 |{' 2.00 (2.00 to 2.00) |' * 3}\n\na processor; ",
     ):
         assert line in text
     assert "nan" not in text
@@ -188,3 +245,150 @@ def test_walks_have_the_shapes_they_stand_for_and_one_length(register, walk):
     env.env.reset()
     ends = [env.env.step(env.action_space.sample())[2:4] for _ in range(env.max_steps)]
     assert ends == [(False, False)] * (env.max_steps - 1) + [(False, True)]
+
+
+# --- PureJaxRL, without it ------------------------------------------------------------------------
+
+PYTHON_STUB = """#!/bin/sh
+echo "$*" >>"{calls}"
+case "$*" in
+*"$BREAK"*) echo "first the noise" >&2; echo "ERROR: the cause" >&2; echo "a hint" >&2; exit 1 ;;
+"-m venv "*) mkdir -p "$3/bin" && cp "$0" "$3/bin/python" ;;
+esac
+"""
+
+
+@pytest.fixture
+def peer(tmp_path, monkeypatch):
+    """A folder with a repository instead of PureJaxRL's, and a Python that only pretends."""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=b"]
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "c"], check=True)
+    commit = subprocess.run([*git, "rev-parse", "HEAD"], check=True, stdout=-1, text=True).stdout
+    monkeypatch.setattr(purejaxrl, "COMMIT", commit.strip())
+    home, lock, stub = tmp_path / "own", tmp_path / "lock", tmp_path / "python"
+    for name, value in {
+        "HOME": home,
+        "CLONE": home / "purejaxrl",
+        "PYTHON": home / "bin" / "python",
+        "LOCK": lock,
+    }.items():
+        monkeypatch.setattr(purejaxrl, name, value)
+    lock.write_text("a==1")
+    stub.write_text(PYTHON_STUB.format(calls=tmp_path / "calls"))
+    stub.chmod(0o755)
+    (tmp_path / "calls").touch()
+    monkeypatch.setattr(sys, "executable", str(stub))
+    monkeypatch.setenv("PUREJAXRL", str(tmp_path))
+    monkeypatch.setenv("BREAK", "nothing")
+    return tmp_path
+
+
+def test_purejaxrl_gets_an_environment_of_its_own_once(peer):
+    purejaxrl.set_up()
+    venv, install = (peer / "calls").read_text().splitlines()
+    assert venv == f"-m venv {peer / 'own'}"
+    assert install.startswith("-m pip install ") and install.endswith(f" -r {peer / 'lock'}")
+    assert {"--no-deps", "--require-hashes"} < set(install.split())
+    assert (peer / "own" / "purejaxrl" / ".git").is_dir()
+    purejaxrl.set_up()
+    assert len((peer / "calls").read_text().splitlines()) == 2, "it is there"
+    (peer / "lock").write_text("a==2")
+    purejaxrl.set_up()
+    assert len((peer / "calls").read_text().splitlines()) == 4, "made anew"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"BREAK": "pip"}, "its packages cannot be had: ERROR: the cause"),
+        ({"BREAK": "venv"}, "its environment cannot be made: ERROR: the cause"),
+        ({"PUREJAXRL": "/no/such folder"}, "its code cannot be had from /no/such folder"),
+        ({"PATH": "/nowhere"}, "its code cannot be had from"),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_without_purejaxrl_one_line_says_why_and_the_rest_goes_on(
+    peer, monkeypatch, capsys, change, reason
+):
+    for name, value in change.items():
+        monkeypatch.setenv(name, value)
+    for _ in range(2):  # what broke off is not taken for complete
+        purejaxrl.measure_all(replace(QUICK, data=peer))
+        began, said = capsys.readouterr().out.splitlines()
+        assert began.startswith("Setting up ")
+        assert said.startswith(f"PureJaxRL is left out: {reason}")
+    table = report.purejaxrl_tables(pd.read_csv(peer / "purejaxrl.csv"))
+    assert table == said.replace("is left out", "was left out")
+
+
+@pytest.mark.parametrize("contestant", purejaxrl.ROLLOUTS)
+def test_purejaxrl_has_our_settings_and_whole_rollouts(run_config, contestant):
+    for scale in (FULL, QUICK):
+        for environment in purejaxrl.ENVIRONMENTS:
+            steps = scale.later_steps[environment]
+            given = purejaxrl.configuration(contestant, environment, steps)
+            rollout = given["NUM_ENVS"] * given["NUM_STEPS"]
+            assert steps % rollout == rollout % given["NUM_MINIBATCHES"] == 0
+    ours, side_by_side = run_config(environment, "ppo").ppo, given["NUM_ENVS"]
+    assert contestant == f"purejaxrl_{side_by_side}x{given['NUM_STEPS']}"
+    assert (given["LR"], given["GAMMA"]) == (ours.actor_learning_rate, ours.discount)
+    assert (given["UPDATE_EPOCHS"], given["CLIP_EPS"]) == (ours.epochs, ours.clip)
+    assert (given["GAE_LAMBDA"], given["ENT_COEF"]) == (ours.gae_lambda, ours.entropy_coefficient)
+    assert given["MAX_GRAD_NORM"] == ours.max_gradient_norm
+    assert ours.hidden_units == [64, 64], "as PureJaxRL has them"
+
+
+FAKE_JAX = """
+import time
+from types import SimpleNamespace
+
+random = SimpleNamespace(PRNGKey=int)
+block_until_ready = next  # nothing happens before
+jit = lambda train: SimpleNamespace(lower=lambda key: SimpleNamespace(compile=lambda: train))
+"""
+FAKE_PPO = """
+import time
+from importlib import import_module
+
+EpisodeWrapper = import_module("brax.envs.wrappers.training").EpisodeWrapper
+import_module("navix")
+
+def make_train(config):
+    def train(key):  # the warm-up is slow
+        end = time.process_time() + (0.3 if key > 7 else 0.01)
+        while time.process_time() < end:
+            pass
+        yield config
+    return train
+"""
+
+
+def test_purejaxrl_is_timed_when_it_is_compiled_and_warm(tmp_path, monkeypatch):
+    from benchmarks import purejaxrl_training
+
+    (tmp_path / "purejaxrl").mkdir()
+    (tmp_path / "purejaxrl" / "ppo.py").write_text(FAKE_PPO)
+    (tmp_path / "jax.py").write_text(FAKE_JAX)
+    for name in purejaxrl_training.PACKAGES.split():
+        folder = tmp_path / f"{name}-1.2.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.2\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(purejaxrl, "PYTHON", sys.executable)
+    monkeypatch.setattr(purejaxrl, "CLONE", tmp_path)
+    reading = purejaxrl.train({"TOTAL_TIMESTEPS": 100}, seed=7)
+    assert reading["steps"] == reading["target_steps"] == 100
+    assert 0.01 <= reading["cpu_seconds"] < 0.2
+    assert reading["steps_per_second"] == 100 / reading["seconds"]
+    assert reading["versions"].startswith("jax 1.2, jaxlib 1.2, ")
+    assert reading.keys() - {"versions"} == speed.read_clock(iter([1]), [1])[0].keys()
+
+
+def test_purejaxrl_s_lock_pins_what_it_needs_with_hashes():
+    lock = purejaxrl.LOCK.read_text(encoding="utf-8")
+    pins = re.findall(r"^(\S+==\S+)(?: \\\n    --hash=sha256:[0-9a-f]{64})+$", lock, re.MULTILINE)
+    assert len(pins) == lock.count("==")
+    asked = purejaxrl.LOCK.with_suffix(".in").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\w+==[\w.]+", asked, re.MULTILINE)) <= set(pins)
+    assert not re.search(r"//|--index|--find", lock), "no address"
