@@ -539,13 +539,13 @@ def test_checkpoints_cost_at_most_one_percent(monkeypatch, cost, wait):
     """Every 10 s, or as seldom as their cost demands; the clock is set by hand."""
     now = [1000.0]
     monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    clock = run.Clock(900.0, 2.0)  # 100 s were spent before an interruption
+    clock = run.Clock(900.0, 2.0, 0.7)  # 100 s before an interruption, 0.7 of them on checkpoints
     assert clock.elapsed() == 100 and not clock.checkpoint_due()
     now[0] += 10
     assert clock.checkpoint_due()
     with clock.saving():
         now[0] += cost
-    assert clock.checkpoint_seconds == pytest.approx(cost)
+    assert clock.checkpoint_seconds == pytest.approx(0.7 + cost)
     now[0] = 1010 + wait - 0.001
     assert not clock.checkpoint_due()
     now[0] += 0.002
