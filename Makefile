@@ -12,6 +12,8 @@ SHELL := bash
 export PYTHONUTF8 := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
+# Compiling every import anew, on a machine that does so by default, takes as long as the work.
+unexport PYTHONDONTWRITEBYTECODE
 unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET PIP_USER
 
 # A command inside the environment. `python -m` also works where the folder's name has a space.

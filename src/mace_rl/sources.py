@@ -70,9 +70,7 @@ def _label(file: Path) -> str:
 def _imported(file: Path) -> Iterator[Path]:
     """The files of this package that importing `file` runs."""
     own = file.relative_to(PACKAGE.parent).with_suffix("") if file.is_relative_to(PACKAGE) else None
-    for node in ast.walk(ast.parse(file.read_bytes(), str(file))):
-        if not isinstance(node, ast.ImportFrom | ast.Import | ast.Constant):
-            continue
+    for node in _imports(file.read_bytes(), str(file)):
         where = f"{file}, line {node.lineno}"
         match node:
             case ast.ImportFrom(module=module, names=names, level=level):
@@ -90,6 +88,13 @@ def _imported(file: Path) -> Iterator[Path]:
                         yield from _module(alias.name, where)
             case ast.Constant(value=str(text)) if re.fullmatch(rf"{NAME}(\.\w+)+(:\w+)?", text):
                 yield from _named(text)
+
+
+@cache  # the scripts of a workflow share most of their sources
+def _imports(content: bytes, name: str) -> list[ast.Import | ast.ImportFrom | ast.Constant]:
+    """All import statements and constants of a file with this content."""
+    kinds = ast.Import | ast.ImportFrom | ast.Constant
+    return [node for node in ast.walk(ast.parse(content, name)) if isinstance(node, kinds)]
 
 
 def _is_ours(module: str | None) -> TypeGuard[str]:

@@ -8,6 +8,7 @@ import pandas as pd
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.statistics import (
+    draws,
     holm,
     logrank,
     paired_comparison,
@@ -161,8 +162,8 @@ def _regret(
     regrets = []  # of each environment: [repetitions + 1], the seeds as they are first
     for area, random in zip(areas, randoms, strict=True):
         seeds = len(area)
-        drawn = generator.integers(seeds, size=(settings.bootstrap_repetitions, seeds))
-        means = area[np.vstack([np.arange(seeds), drawn])].mean(axis=1)
+        drawn = draws(seeds, settings.bootstrap_repetitions, generator)
+        means = np.vstack([np.ones(seeds), drawn]) @ area / seeds
         best = means[:, 1:].max(axis=1)
         regrets.append((best - means[:, 0]) / np.where(best > random, best - random, np.nan))
     mean, *resampled = np.mean(regrets, axis=0)

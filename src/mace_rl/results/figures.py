@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # imported where they are used: planning the workflow does wi
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_POINTS = 1000  # per curve: closer than a printer's dots, and a PDF of a bearable size
+MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
@@ -57,7 +57,7 @@ def seed_curves(frames: "Mapping[RunKey, pd.DataFrame]", shown: Quantity) -> "pd
 
     `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
     is over the last `window` episodes; over all there are so far in the first `window` - 1. Of
-    E > 1000 episodes only every ⌈E / 1000⌉-th is kept, counted back from the last: more could not
+    E > 500 episodes only every ⌈E / 500⌉-th is kept, counted back from the last: more could not
     be seen.
     Columns: env, variant, seed, episode and the average by its name.
     """

@@ -11,7 +11,7 @@ from mace_rl.config.results import MetricsConfig, RegretConfig
 from mace_rl.results.aggregate import SCORED, scores
 from mace_rl.results.figures import LEGEND_HEIGHT, PANEL_HEIGHT, WIDTH, style
 from mace_rl.results.metrics import METRICS
-from mace_rl.results.statistics import mean_interval, percentiles
+from mace_rl.results.statistics import draws, mean_interval, percentiles
 
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
     from matplotlib.axes import Axes
@@ -37,10 +37,9 @@ def profiles(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         reached = np.zeros(len(tau))  # runs, of which those drawn are [repetitions, τ]
         resampled = np.zeros((settings.bootstrap_repetitions, len(tau)))
         for values in strata:
-            high_enough, count = values[:, None] >= tau, len(values)  # [seeds, τ]
-            drawn = generator.multinomial(count, np.full(count, 1 / count), len(resampled))
+            high_enough = (values[:, None] >= tau).astype(np.float64)  # [seeds, τ]
             reached += high_enough.sum(axis=0)
-            resampled += drawn @ high_enough
+            resampled += draws(len(values), len(resampled), generator) @ high_enough
         bounds = percentiles(resampled, settings.confidence, min(map(len, strata))) / len(runs)
         columns = {"score": tau, "share": reached / len(runs), "low": bounds[0], "high": bounds[1]}
         frames.append(pd.DataFrame({"metric": metric, "variant": variant} | columns))

@@ -43,11 +43,11 @@ def mean_interval(
         error = np.std(values, axis=0, ddof=1) / np.sqrt(seeds)
         half = scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2) * error
         return mean - half, mean + half
-    chosen = generator.integers(seeds, size=(repetitions, seeds))
+    drawn = draws(seeds, repetitions, generator)
     flat = values.reshape(seeds, -1)  # [seeds, points]
-    points = max(1, CHUNK // chosen.size)
+    points = max(1, CHUNK // repetitions)
     bounds = [  # the same resampled seeds serve every point
-        percentiles(np.mean(flat[chosen, start : start + points], axis=1), confidence, seeds)
+        percentiles(drawn @ flat[:, start : start + points] / seeds, confidence, seeds)
         for start in range(0, flat.shape[1], points)
     ]
     low, high = np.concatenate(bounds, axis=1)
@@ -110,8 +110,7 @@ def stratified_comparison(
         half = float(scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error)
         return tested._replace(low=tested.difference - half, high=tested.difference + half)
     means = [
-        np.mean(values[generator.integers(len(values), size=(repetitions, len(values)))], axis=1)
-        for values in differences
+        draws(len(values), repetitions, generator) @ values / len(values) for values in differences
     ]
     low, high = percentiles(np.mean(means, axis=0), confidence, smallest)
     return tested._replace(low=float(low), high=float(high))
@@ -163,13 +162,10 @@ def probability_of_improvement(
     means, resampled = [], np.zeros(repetitions)
     for x, y in pairs:
         wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m]
-        share_x, share_y = (  # [repetitions, n or m]: how often each run was drawn
-            generator.multinomial(count, np.full(count, 1 / count), size=repetitions) / count
-            for count in wins.shape
-        )
-        one = np.nan if min(wins.shape) == 1 else np.sum((share_x @ wins) * share_y, axis=1)
+        drawn_x, drawn_y = (draws(runs, repetitions, generator) for runs in wins.shape)
+        one = np.nan if min(wins.shape) == 1 else np.sum((drawn_x @ wins) * drawn_y, axis=1)
         means.append(wins.mean())
-        resampled += one / len(pairs)
+        resampled += one / wins.size / len(pairs)
     low, high = percentiles(resampled, confidence, min(min(x.size, y.size) for x, y in pairs))
     return float(np.mean(means)), float(low), float(high)
 
@@ -189,16 +185,27 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     return np.minimum(adjusted, 1)
 
 
-def percentiles(resampled: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
-    """The bounds [2, …] of a bootstrap interval from `resampled` [repetitions, …].
+def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.ndarray:
+    """How often each of `count` values is in each bootstrap sample of that size.
+
+    As float64 [repetitions, count]: `draws @ values / count` are the means of the samples.
+    """
+    drawn = generator.integers(count, size=(repetitions, count))
+    drawn += count * np.arange(repetitions)[:, None]  # each sample has a range of its own
+    times = np.bincount(drawn.ravel(), minlength=repetitions * count)
+    return times.reshape(repetitions, count).astype(np.float64)
+
+
+def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
+    """The bounds [2, …] of a bootstrap interval from `estimates` [repetitions, …].
 
     The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
     the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
     a bootstrap over 10 seeds is too narrow otherwise (tools.coverage). With one seed, and where
-    one of `resampled` is NaN, NaN.
+    one of `estimates` is NaN, NaN.
     """
     if seeds == 1:
-        return np.full((2, *resampled.shape[1:]), np.nan)
+        return np.full((2, *estimates.shape[1:]), np.nan)
     wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
     tail = 100 * scipy.special.ndtr(-wider)
-    return np.percentile(resampled, [tail, 100 - tail], axis=0)
+    return np.percentile(estimates, [tail, 100 - tail], axis=0)
