@@ -46,7 +46,7 @@ rule all:
         f"{RESULTS}/figure2.pdf",
         f"{RESULTS}/figure2.png",
         f"{RESULTS}/figure2.csv",
-        *[f"{RESULTS}/{picture}.{kind}" for picture in PICTURES for kind in ("pdf", "png")],
+        *[f"{RESULTS}/{picture}.{kind}" for picture in PICTURES + REGRET for kind in ("pdf", "png")],
         f"{RESULTS}/profiles.csv",
         f"{RESULTS}/readings.csv",
         f"{RESULTS}/readings.md",

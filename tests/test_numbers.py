@@ -86,3 +86,21 @@ def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
     assert share == pytest.approx(30, abs=3)
     assert len(show.ledger(tmp_path)) == 12
     assert sum("| holds |" in line for line in show.parts(tmp_path)) == 22
+
+
+def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
+    """Two studies: in B-v0 of the second every run of the variant wins, elsewhere half do."""
+    (tmp_path / "first").mkdir()
+    (tmp_path / "second").mkdir()
+    areas = {"first": {"A-v0": ([1.0, 3.0], [2.0, 2.0])}}
+    areas["second"] = {"A-v0": ([1.0], [9.0]), "B-v0": ([5.0, 6.0, 7.0], [1.0, 2.0, 3.0])}
+    for name, environments in areas.items():
+        rows = [
+            {"env": env, "variant": variant, "seed": seed, "area_under_curve": area}
+            for env, both in environments.items()
+            for variant, values in zip(("full", "other"), both, strict=True)
+            for seed, area in enumerate(values)
+        ]
+        write(pd.DataFrame(rows), tmp_path / name)
+    line = show.together(tmp_path / "first", "second", "full", "other")[-1]
+    assert line.startswith("| full over other | 2 | 2 to 3 | 0.75 (")

@@ -13,6 +13,8 @@ FOLDER is one of reference/tables, or the results of any study. WHAT is one of
     constants   mean return of training by variant, in columns                     (metrics.csv)
     regret      what the learnt β loses against the best constant                   (regret.csv)
     improvement probability that one variant's run is better than another's    (comparisons.csv)
+    together    the same over the environments of several studies: `together FOLDER NAME ... VARIANT
+                OTHER ...`, NAMEs of folders beside FOLDER                         (metrics.csv)
     aggregate   scores between random and the best run, all environments          (aggregate.csv)
     readings    Table 1 under every reading                                         (readings.md)
 """
@@ -31,7 +33,7 @@ import pandas as pd
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.claims import LITERAL, ROBUST, digits_of
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import mean_interval, probability_of_improvement
 
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = MetricsConfig.model_validate(read_yaml(ROOT / "config.yaml")["metrics"])
@@ -179,6 +181,38 @@ def improvement(folder: Path, metric: str = AREA) -> list[str]:
     return lines
 
 
+def together(folder: Path, *words: str) -> list[str]:
+    """P(a run of one variant is better) over all environments that two have in any of the studies.
+
+    The first word that is no folder beside `folder` is the variant, the others are those it is
+    compared with. Where several studies have the same runs, the one that has most of them counts.
+    """
+    names = [word for word in words if (folder.parent / word).is_dir()]
+    variant, *others = (word for word in words if word not in names)
+    runs: dict[tuple[str, str], np.ndarray] = {}
+    for place in (folder, *(folder.parent / name for name in names)):
+        table = pd.read_csv(place / "metrics.csv")
+        for (env, name), rows in table.groupby(["env", "variant"], sort=False):
+            areas = rows[AREA].to_numpy(np.float64)
+            key = str(env), str(name)
+            runs[key] = max(areas, runs.get(key, areas[:0]), key=len)
+    lines = ["| | environments | seeds in each | probability |", "|---" * 4 + "|"]
+    for other in others:
+        both = [env for env, name in runs if name == other and (env, variant) in runs]
+        pairs = [(runs[env, variant], runs[env, other]) for env in both]
+        generator = np.random.default_rng(SETTINGS.bootstrap_seed)
+        value, low, high = probability_of_improvement(
+            pairs, SETTINGS.confidence, SETTINGS.bootstrap_repetitions, generator
+        )
+        counts = {min(len(x), len(y)) for x, y in pairs}
+        seeds = str(*counts) if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
+        lines.append(
+            f"| {variant} over {other} | {len(both)} | {seeds} |"
+            f" {value:.2f} ({low:.2f} to {high:.2f}) |"
+        )
+    return lines
+
+
 def aggregate(folder: Path) -> list[str]:
     """aggregate.csv."""
     lines = ["| | | runs | mean | interquartile mean |", "|---" * 5 + "|"]
@@ -242,7 +276,7 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
     function.__name__: function
     for function in (
         *(headline, ledger, parts, table1, means, solved, constants, regret, improvement),
-        *(aggregate, readings),
+        *(together, aggregate, readings),
     )
 }
 

@@ -28,7 +28,7 @@ PAGE = "report.html"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
     *("metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure", "claims"),
-    *("pictures", "readings", "page"),
+    *("pictures", "regret_figure", "readings", "page"),
 )
 
 

@@ -67,6 +67,31 @@ rule pictures:
         "../scripts/pictures.py"
 
 
+if REGRET:
+
+    localrules:
+        regret_figure,
+
+    rule regret_figure:
+        input:
+            f"{RESULTS}/metrics.csv",
+        output:
+            pdf=f"{RESULTS}/regret.pdf",
+            png=report(
+                f"{RESULTS}/regret.png", caption="../report/regret.rst", category="Supplement"
+            ),
+        log:
+            f"{RESULTS}/logs/regret_figure.log",
+        params:
+            runs=BUDGETS,
+            settings=MEASURED.model_dump(),
+            labels=study.labels,
+            colours=study.colours,
+            code=code("regret_figure.py", MEASURED),
+        script:
+            "../scripts/regret_figure.py"
+
+
 rule readings:
     input:
         EPISODES,

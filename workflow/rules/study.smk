@@ -45,8 +45,9 @@ TESTS_CLAIMS = (
     and set(paper.ENVIRONMENTS) <= set(study.metrics.reference_return)
 )
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
-# Pictures of every run at once; one of the regret only where the configuration asks for it.
-PICTURES = ["every_seed", "profiles", *(["regret"] if study.metrics.regret else [])]
+# The regret of a learnt β only where the configuration asks for it.
+PICTURES = ["every_seed", "profiles"]
+REGRET = ["regret"] if study.metrics.regret else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = {key: value for key, value in given.items() if key != "results"}
 COMMAND = ["snakemake", "all"]

@@ -24,23 +24,16 @@ rule table1:
         "../scripts/table1.py"
 
 
-# What the learnt β loses against the best constant one: only where the configuration asks for it.
-REGRET = (
-    {
-        "regret": report(
-            f"{RESULTS}/regret.csv", caption="../report/regret.rst", category="Supplement"
-        )
-    }
-    if MEASURED.regret
-    else {}
-)
-
-
 rule comparisons:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        **REGRET,
+        **{
+            name: report(
+                f"{RESULTS}/{name}.csv", caption="../report/regret.rst", category="Supplement"
+            )
+            for name in REGRET
+        },
         comparisons=report(
             f"{RESULTS}/comparisons.csv",
             caption="../report/comparisons.rst",

@@ -1,4 +1,4 @@
-"""Pictures of every run: all seeds, performance profiles and, where there is one, the regret."""
+"""Pictures of every run: all seeds, and performance profiles."""
 
 from job import job
 
@@ -21,8 +21,6 @@ with job("pictures", snakemake.log[0]):
         "every_seed": pictures.draw_every_seed(table, *names),
         "profiles": pictures.draw_profiles(curves, *names),
     }
-    if settings.regret:
-        figures["regret"] = pictures.draw_regret(table, settings.regret, settings, *names)
     for path in snakemake.output:
         if path != snakemake.output.profiles:
             save_figure(figures[Path(path).stem], path)
