@@ -50,7 +50,8 @@ def pack(results: Path, archives: Path) -> int:
     count = 0
     for variant in sorted(results.glob("runs/*/*")):
         archive = archives / variant.parent.name / f"{variant.name}.tar.xz"
-        content = read(archive) if archive.exists() else {}
+        packed = read(archive) if archive.exists() else {}
+        content = dict(packed)
         for run in variant.glob("seed*"):
             if not (run / files.RECORD).exists():
                 continue  # not finished
@@ -61,7 +62,7 @@ def pack(results: Path, archives: Path) -> int:
                     raise ValueError(f"{run / name}: not the file that run.json describes")
             for name in (*kept, files.RECORD):
                 content[f"{run.name}/{name}"] = (run / name).read_bytes()
-        if content:
+        if content != packed:  # compressing takes seconds
             write(archive, content)
         count += sum(name.endswith(files.RECORD) for name in content)
     return count

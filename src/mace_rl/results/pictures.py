@@ -141,7 +141,7 @@ def draw_regret(
                     label=None if own else labels[name],
                 )
             means = runs.groupby("variant")["area_under_curve"].mean()[regret.constants]
-            ticks = [labels[name].removeprefix("β = ") for name in means.index]
+            ticks = [labels[name].removeprefix("β = ").partition(" (")[0] for name in means.index]
             axes.plot(range(len(means)), means, color="dimgray", linewidth=0.8)
             axes.set_xticks(range(len(means)), ticks)
             axes.set_title(environment)
