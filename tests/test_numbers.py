@@ -104,3 +104,12 @@ def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
         write(pd.DataFrame(rows), tmp_path / name)
     line = show.together(tmp_path / "first", "second", "full", "other")[-1]
     assert line.startswith("| full over other | 2 | 2 to 3 | 0.75 (")
+
+
+def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
+    rows = [
+        {"env": "A-v0", "variant": "ppo", "final_return": final, "area_under_curve": 2 * final}
+        for final in (3.0, 1.0, 5.0)
+    ]
+    (line,) = show.finals(write(pd.DataFrame(rows), tmp_path))[2:]
+    assert line == "| ppo | 3 [1] / 6 |"

@@ -11,6 +11,7 @@ FOLDER is one of reference/tables, or the results of any study. WHAT is one of
     means       final return and mean return of training; `means FOLDER COLUMN ...` (metrics.csv)
     solved      how many seeds solve each task                                     (metrics.csv)
     constants   mean return of training by variant, in columns                     (metrics.csv)
+    finals      final return [worst seed] / mean return of training, in columns     (metrics.csv)
     regret      what the learnt β loses against the best constant                   (regret.csv)
     improvement probability that one variant's run is better than another's    (comparisons.csv)
     together    the same over the environments of several studies: `together FOLDER NAME ... VARIANT
@@ -154,6 +155,17 @@ def constants(folder: Path) -> list[str]:
     return _columns(folder, lambda runs: _mean(runs[AREA]))
 
 
+def finals(folder: Path) -> list[str]:
+    """The final return, that of the worst seed, and the mean return of training by variant."""
+    return _columns(
+        folder,
+        lambda runs: (
+            f"{_short(runs['final_return'].mean())} [{_short(runs['final_return'].min())}] /"
+            f" {_short(runs[AREA].mean())}"
+        ),
+    )
+
+
 def regret(folder: Path) -> list[str]:
     """regret.csv."""
     lines = ["| | best constant | its return | learned β | regret | seeds |", "|---" * 6 + "|"]
@@ -276,7 +288,7 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
     function.__name__: function
     for function in (
         *(headline, ledger, parts, table1, means, solved, constants, regret, improvement),
-        *(together, aggregate, readings),
+        *(finals, together, aggregate, readings),
     )
 }
 
