@@ -1,6 +1,7 @@
 """What several test files share: configurations of runs, environments for a test."""
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from mace_rl.config.section import check
 from mace_rl.config.study import Study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
+
+# Where the tests run in the background SIGINT is ignored, and would be in what they start, too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from mace_rl import arithmetic
 
 PATIENCE = 1.0  # seconds between looks at whether Snakemake is alive
-COURTESY = 0.5  # seconds for Snakemake to be interrupted first: it would call this a failure
 
 logger = logging.getLogger("job")
 
@@ -36,7 +35,6 @@ def job(title: str, log: str) -> Iterator[None]:
 
     def interrupted(*_: object) -> None:
         os.write(2, f"{title}: interrupted\n".encode())
-        time.sleep(COURTESY)
         os._exit(130)
 
     # An ordinary KeyboardInterrupt is lost if numba happens to compile; results are written
