@@ -11,7 +11,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from tests.test_claims import table
-from tools import printed, show
+from tools import bonus_share, printed, show
 
 ROOT = Path(__file__).parents[1]
 
@@ -113,3 +113,15 @@ def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
     ]
     (line,) = show.finals(write(pd.DataFrame(rows), tmp_path))[2:]
     assert line == "| ppo | 3 [1] / 6 |"
+
+
+def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed, scale in enumerate((1, 3)):
+        run = tmp_path / "A-v0" / "beta_1" / f"seed{seed}"
+        run.mkdir(parents=True)
+        shares = [scale * n / 100 for n in range(20)]  # 0.00, 0.01; …; 0.18, 0.19, times scale
+        pd.DataFrame({"bonus_share": shares}).to_csv(run / "diagnostics.csv", index=False)
+    bonus_share.main(tmp_path, ["beta_1", "beta_2"])
+    assert capsys.readouterr().out.splitlines()[-1] == "| A-v0 | 0.01 / 0.37 |  |"
