@@ -12,7 +12,7 @@ SHELL := bash
 export PYTHONUTF8 := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
-# Compiling every import anew, on a machine that does so by default, takes as long as the work.
+# Where it is set, every process compiles its imports anew, which takes longer than running them.
 unexport PYTHONDONTWRITEBYTECODE
 unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET PIP_USER
 

@@ -104,6 +104,12 @@ def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
         write(pd.DataFrame(rows), tmp_path / name)
     line = show.together(tmp_path / "first", "second", "full", "other")[-1]
     assert line.startswith("| full over other | 2 | 2 to 3 | 0.75 (")
+    for words, reason in (
+        (("full", "nobody"), "'full' and 'nobody'"),
+        (("full",), "wants a variant"),
+    ):
+        with pytest.raises(SystemExit, match=reason):
+            show.together(tmp_path / "first", "second", *words)
 
 
 def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
@@ -125,3 +131,5 @@ def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
         pd.DataFrame({"bonus_share": shares}).to_csv(run / "diagnostics.csv", index=False)
     bonus_share.main(tmp_path, ["beta_1", "beta_2"])
     assert capsys.readouterr().out.splitlines()[-1] == "| A-v0 | 0.01 / 0.37 |  |"
+    with pytest.raises(SystemExit, match=r"no diagnostics\.csv of beta_2"):
+        bonus_share.main(tmp_path, ["beta_2"])

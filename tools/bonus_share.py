@@ -7,6 +7,7 @@ each variant: means over seeds.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ def first_and_last(diagnostics: Path) -> tuple[float, float]:
 
 
 def main(runs: Path, variants: list[str]) -> None:
-    """Print the table as Markdown."""
+    """Print the table as Markdown; exits with one line if there is nothing to print."""
+    if not any(any(runs.glob(f"*/{variant}/seed*/diagnostics.csv")) for variant in variants):
+        sys.exit(f"bonus_share: {runs} has no diagnostics.csv of {', '.join(variants)}")
     print(f"| | {' | '.join(variants)} |")
     print("|---" * (1 + len(variants)) + "|")
     for environment in sorted(path for path in runs.iterdir()):

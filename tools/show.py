@@ -200,7 +200,9 @@ def together(folder: Path, *words: str) -> list[str]:
     compared with. Where several studies have the same runs, the one that has most of them counts.
     """
     names = [word for word in words if (folder.parent / word).is_dir()]
-    variant, *others = (word for word in words if word not in names)
+    variant, *others = [word for word in words if word not in names] or [""]
+    if not others:
+        sys.exit("show: together wants a variant and those to compare it with")
     runs: dict[tuple[str, str], np.ndarray] = {}
     for place in (folder, *(folder.parent / name for name in names)):
         table = pd.read_csv(place / "metrics.csv")
@@ -211,6 +213,8 @@ def together(folder: Path, *words: str) -> list[str]:
     lines = ["| | environments | seeds in each | probability |", "|---" * 4 + "|"]
     for other in others:
         both = [env for env, name in runs if name == other and (env, variant) in runs]
+        if not both:
+            sys.exit(f"show: no environment has runs of both {variant!r} and {other!r}")
         pairs = [(runs[env, variant], runs[env, other]) for env in both]
         generator = np.random.default_rng(SETTINGS.bootstrap_seed)
         value, low, high = probability_of_improvement(
