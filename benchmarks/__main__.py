@@ -7,7 +7,7 @@ from importlib import import_module
 from benchmarks.settings import FULL, QUICK
 
 PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "purejaxrl", "arithmetic")
-PARTS += ("report",)
+PARTS += ("update", "report")
 
 
 def main() -> None:

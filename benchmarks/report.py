@@ -10,7 +10,7 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from benchmarks import arithmetic, purejaxrl, start, wrapper
+from benchmarks import arithmetic, purejaxrl, start, update, wrapper
 from benchmarks.breakdown import ALL_SECTIONS
 from benchmarks.settings import (
     ACROBOT,
@@ -49,8 +49,9 @@ RATIOS = (
 def measure_all(scale: Scale) -> None:
     """Write the document and the pictures of the data in `scale.data`, and summary.csv."""
     names = ("results", "breakdown", "growth", "workflow", "planning", "start", "wrapper")
-    data = [pd.read_csv(scale.data / f"{name}.csv") for name in (*names, "purejaxrl", "arithmetic")]
-    results, times, growth, jobs, planning, starts, costs, peers, prices = data
+    names += ("purejaxrl", "arithmetic", "update")
+    data = [pd.read_csv(scale.data / f"{name}.csv") for name in names]
+    results, times, growth, jobs, planning, starts, costs, peers, prices, one_update = data
     summary = speed_summary(results)
     summary.to_csv(scale.data / "summary.csv", index=False)
     draw_speed(summary, scale)
@@ -70,6 +71,7 @@ def measure_all(scale: Scale) -> None:
         "wrapper": wrapper.table(costs),
         "purejaxrl": purejaxrl_tables(peers),
         "arithmetic": arithmetic_table(prices),
+        "update": update_table(one_update),
     }
     text = filled((ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), tables)
     scale.document.write_text(text, encoding="utf-8")
@@ -365,6 +367,22 @@ def arithmetic_table(rows: pd.DataFrame) -> str:
         for kind, own in rows.groupby("arithmetic", sort=False)
     ]
     return f"{markdown(table, columns)}\n\n{'; '.join(used)}."
+
+
+def update_table(rows: pd.DataFrame) -> str:
+    """µs of each part of an update by what may use all of the processor; *: other bits."""
+    lines = []
+    for part, own in rows.groupby("part", sort=False):
+        times = own.pivot(index="repeat", columns="kind", values="microseconds")
+        bits = own.groupby("kind")["digest"].unique()
+        cells = [
+            median_and_range(times[kind], ".1f")
+            + "*" * (list(bits[kind]) != list(bits["portable"]))
+            for kind in update.KINDS
+        ]
+        lines.append([part, *cells, median_and_range(times["native"] / times["portable"], ".2f")])
+    columns = [*update.KINDS, "native ÷ portable"]
+    return markdown(pd.DataFrame(lines, columns=["µs of CPU time", *columns]), columns)
 
 
 def median_and_range(values: pd.Series, form: str) -> str:

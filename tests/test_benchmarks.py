@@ -20,6 +20,7 @@ from benchmarks import (
     settings,
     speed,
     start,
+    update,
     wrapper,
 )
 from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FULL, HOPPER, OURS, QUICK, VARIANTS
@@ -98,6 +99,14 @@ def data(tmp_path):
         for kind, factor in zip(arithmetic.KINDS, (0.75, 1), strict=True)
     ]
     pd.DataFrame(prices).to_csv(tmp_path / "arithmetic.csv")
+    one_update = [
+        {"repeat": repeat, "kind": kind, "part": part, "microseconds": factor * (2 + repeat)}
+        | {"digest": kind if "native" in kind and "numba" not in kind else "same"}
+        for repeat in range(2)
+        for kind, factor in zip(update.KINDS, (2.0, 1.0, 1.0, 1.5), strict=True)
+        for part in ("forward", update.OWN_PRODUCTS)
+    ]
+    pd.DataFrame(one_update).to_csv(tmp_path / "update.csv")
     return tmp_path
 
 
@@ -106,6 +115,31 @@ def test_the_price_of_portable_arithmetic_is_taken_within_a_repeat(data):
     assert "| ppo, CartPole-v1 | 1,125 (750 to 1,500) | 1,500 (1,000 to 2,000) |" in table
     assert table.count("| 0.75 (0.75 to 0.75) | 2 |") == len(ENVIRONMENTS) * 2
     assert "native: blas NATIVE" in table and "torch PORTABLE" in table
+
+
+def test_the_table_of_an_update_marks_other_bits(data):
+    line = report.update_table(pd.read_csv(data / "update.csv")).splitlines()[2]
+    cells = ["forward", "5.0 (4.0 to 6.0)", "2.5 (2.0 to 3.0)*", "2.5 (2.0 to 3.0)*"]
+    assert line == f"| {' | '.join([*cells, '3.8 (3.0 to 4.5)', '0.50 (0.50 to 0.50)'])} |"
+
+
+@pytest.mark.slow
+def test_parts_of_an_update_are_measured_with_the_libraries_that_were_chosen(tmp_path, monkeypatch):
+    update.measure_all(replace(QUICK, data=tmp_path))
+    rows = pd.read_csv(tmp_path / "update.csv").set_index(["kind", "part"])
+    assert (rows["microseconds"] > 0).all() and set(rows.index.levels[0]) == set(update.KINDS)
+    monkeypatch.setattr(update, "ROUNDS", 1)
+    here = {row["part"]: row["digest"] for row in update.measure()}
+    assert here == rows.loc["portable", "digest"].to_dict(), "this process is portable"
+
+
+def test_the_loops_of_an_update_compute_what_the_library_does():
+    found = {}
+    for name, (compute, results) in update.parts().items():
+        compute()
+        found[name] = [result.copy() for result in results()]
+    for ours, library in zip(found[update.OWN_PRODUCTS], found[update.PRODUCTS], strict=True):
+        np.testing.assert_allclose(ours, library, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -136,15 +136,26 @@ def logrank(
     at_risk = np.sum(times[:, None] <= times, axis=1)  # [n + m]: those that are not earlier
     expected = (times[:, None] >= times) @ (reached / at_risk)
     scores = reached - expected
-    return float(
-        scipy.stats.permutation_test(
+
+    def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return np.round(np.mean(x, axis=axis) - np.mean(y, axis=axis), 12)  # ties
+
+    if scipy.special.comb(len(times), len(x)) <= repetitions:
+        tested = scipy.stats.permutation_test(
             (scores[: len(x)], scores[len(x) :]),
-            lambda x, y, axis: np.round(np.mean(x, axis=axis) - np.mean(y, axis=axis), 12),  # ties
+            statistic,
             n_resamples=repetitions,
-            rng=generator,
             vectorized=True,
-        ).pvalue
-    )
+        )
+    else:  # which `permutation_test` would draw one by one
+        tested = scipy.stats.monte_carlo_test(
+            scores,
+            lambda size: generator.permuted(np.broadcast_to(scores, size), axis=-1),
+            lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
+            n_resamples=repetitions,
+            vectorized=True,
+        )
+    return float(tested.pvalue)
 
 
 def probability_of_improvement(
