@@ -222,3 +222,15 @@ def test_make_help_lists_every_target():
     targets = re.search(r"^\.PHONY:(.*)$", MAKEFILE, re.MULTILINE)[1].split()
     run = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True)
     assert set(re.findall(r"^make (\S+)", run.stdout, re.MULTILINE)) == set(targets)
+
+
+def test_what_would_slow_every_process_down_is_taken_away():
+    target = "shown:; @echo $${PYTHONDONTWRITEBYTECODE-unset}"
+    run = subprocess.run(
+        ["make", "-s", "--eval", target, "shown"],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert run.stdout == "unset\n", run.stderr
