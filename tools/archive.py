@@ -12,8 +12,10 @@ equal runs give equal files.
 import argparse
 import io
 import lzma
+import os
 import sys
 import tarfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mace_rl import files
@@ -70,15 +72,17 @@ def pack(results: Path, archives: Path) -> int:
 
 def unpack(archives: Path, results: Path) -> int:
     """Put the runs in `archives` where they were below `results`; returns how many."""
-    count = 0
-    for archive in sorted(archives.glob("*/*.tar.xz")):
+
+    def put_back(archive: Path) -> int:
         variant = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
         content = read(archive)
         for name, data in content.items():
             (variant / name).parent.mkdir(parents=True, exist_ok=True)
             write_atomically(variant / name, data)
-        count += sum(name.endswith(files.RECORD) for name in content)
-    return count
+        return sum(name.endswith(files.RECORD) for name in content)
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return sum(pool.map(put_back, sorted(archives.glob("*/*.tar.xz"))))
 
 
 def main() -> None:
