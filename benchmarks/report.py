@@ -232,7 +232,7 @@ def goals(
     long_run = "time per step, last tenth ÷ second tenth of a long `mace_full` run"
     rows += [
         (long_run, per_step, "", "≤ 1.2", "1.0"),
-        ("peak memory of one training", peak, "", "≤ 700 MB", "≤ 450 MB"),
+        ("peak memory of one training of 200 episodes", peak, "", "≤ 700 MB", "≤ 450 MB"),
         (share, f"{study['share']:.1%}", "", "≤ 5 %", "≤ 2 %"),
         (planning, f"{plan['seconds']:.0f} s", "", "≤ 60 s", "≤ 20 s"),
     ]

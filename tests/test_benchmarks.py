@@ -195,7 +195,7 @@ def test_report_is_written_from_the_data(data):
         "| our PPO, an update per episode (default) | **15,000** (10,000 to 20,000) 10.0× |",
         "| … later in training | **30,000** (20,000 to 40,000) 20.0× |",
         "| everybody | 100 | 100 | 100 |",
-        "| peak memory of one training | 350 MB |",
+        "| peak memory of one training of 200 episodes | 350 MB |",
         "| ppo | 350 | 350 | 350 |",
         "| walk | 40 | 400 | 1110000.0 | 3.000 | 80 | 400 |",
         "| a job of the workflow, s | 3.00 (2.00 to 4.00) | 6.00 (4.00 to 8.00) |",

@@ -334,3 +334,16 @@ def test_planning_three_thousand_runs(tmp_path: Path) -> None:
     jobs = project.planned()
     print(f"planning 3,000 runs took {time.monotonic() - start:.1f} s")
     assert jobs == {"train": 3000, "table2": 1, **EVALUATION}
+
+
+@pytest.mark.parametrize("option", ["--cores 1", "-c1", "-j1"])
+def test_no_more_jobs_run_at_once_than_cores_are_given(tmp_path, option):
+    (tmp_path / "Snakefile").write_text(
+        "rule all:\n    input: expand('{n}', n=range(2))\n"
+        "rule one:\n    output: '{n}'\n"
+        "    shell: 'echo begin >>said; sleep 0.5; echo end >>said; touch {output}'\n"
+    )
+    command = [sys.executable, "-m", "snakemake", *option.split()]
+    command += ["--workflow-profile", str(ROOT / "profiles" / "default")]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    assert (tmp_path / "said").read_text().split() == ["begin", "end"] * 2
