@@ -26,8 +26,8 @@ from benchmarks.settings import (
     Scale,
 )
 
-# Environment steps of one training at the paper's budgets (2000, 2000, 6000 episodes), about: means of
-# `env_steps` in reference/tables/study/metrics.csv.
+# Environment steps of one training at the paper's budgets (2000, 2000, 6000 episodes), about: means
+# of `env_steps` in reference/tables/study/metrics.csv.
 PAPER_STEPS = {CARTPOLE: 972_000, ACROBOT: 190_000, HOPPER: 4_770_000}
 STUDY_SEEDS = 10
 GROWTH = "time per step, last tenth ÷ second"
