@@ -20,6 +20,8 @@ from benchmarks import (
     settings,
     speed,
     start,
+    summaries,
+    tables,
     update,
     wrapper,
 )
@@ -111,14 +113,14 @@ def data(tmp_path):
 
 
 def test_the_price_of_portable_arithmetic_is_taken_within_a_repeat(data):
-    table = report.arithmetic_table(pd.read_csv(data / "arithmetic.csv"))
+    table = tables.arithmetic_table(pd.read_csv(data / "arithmetic.csv"))
     assert "| ppo, CartPole-v1 | 1,125 (750 to 1,500) | 1,500 (1,000 to 2,000) |" in table
     assert table.count("| 0.75 (0.75 to 0.75) | 2 |") == len(ENVIRONMENTS) * 2
     assert "native: blas NATIVE" in table and "torch PORTABLE" in table
 
 
 def test_the_table_of_an_update_marks_other_bits(data):
-    line = report.update_table(pd.read_csv(data / "update.csv")).splitlines()[2]
+    line = tables.update_table(pd.read_csv(data / "update.csv")).splitlines()[2]
     cells = ["forward", "5.0 (4.0 to 6.0)", "2.5 (2.0 to 3.0)*", "2.5 (2.0 to 3.0)*"]
     assert line == f"| {' | '.join([*cells, '3.8 (3.0 to 4.5)', '0.50 (0.50 to 0.50)'])} |"
 
@@ -174,17 +176,17 @@ def test_clock_is_read_at_the_first_step_count_past_each_stop():
 
 
 def test_paper_budget_by_hand(data, monkeypatch):
-    monkeypatch.setattr(report, "PAPER_STEPS", {CARTPOLE: 300_000})
-    monkeypatch.setattr(report, "STUDY_SEEDS", 2)
+    monkeypatch.setattr(summaries, "PAPER_STEPS", {CARTPOLE: 300_000})
+    monkeypatch.setattr(summaries, "STUDY_SEEDS", 2)
     results, jobs = pd.read_csv(data / "results.csv"), pd.read_csv(data / "jobs.csv")
-    budget = report.paper_budget(results, jobs)
+    budget = summaries.paper_budget(results, jobs)
     per_job = (2 * 14 - 20) / 4
     assert (budget["before"], budget["after"], budget["per_job"]) == (3, 5, per_job)
     # The median rate of the last readings is 30,000 steps/s: six jobs of 10 s on two cores.
     assert (budget["jobs"], budget["training"]) == (6, 60)
     assert budget["wall"] == 3 + 3 * (10 + per_job) + 5
     assert budget["share"] == pytest.approx(1 - 60 / (2 * budget["wall"]))
-    assert report.makespan([1, 5, 2, 3], cores=2) == 6  # 5 + 1 beside 3 + 2
+    assert summaries.makespan([1, 5, 2, 3], cores=2) == 6  # 5 + 1 beside 3 + 2
 
 
 def test_report_is_written_from_the_data(data):
@@ -352,7 +354,7 @@ def test_without_purejaxrl_one_line_says_why_and_the_rest_goes_on(
         began, said = capsys.readouterr().out.splitlines()
         assert began.startswith("Setting up ")
         assert said.startswith(f"PureJaxRL is left out: {reason}")
-    table = report.purejaxrl_tables(pd.read_csv(peer / "purejaxrl.csv"))
+    table = tables.purejaxrl_tables(pd.read_csv(peer / "purejaxrl.csv"))
     assert table == said.replace("is left out", "was left out")
 
 

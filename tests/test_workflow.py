@@ -336,7 +336,8 @@ def test_planning_three_thousand_runs(tmp_path: Path) -> None:
     assert jobs == {"train": 3000, "table2": 1, **EVALUATION}
 
 
-@pytest.mark.parametrize("option", ["--cores 1", "-c1", "-j1"])
+@pytest.mark.slow
+@pytest.mark.parametrize("option", ["--cores 1", "--core=1", "-c1", "-j1"])
 def test_no_more_jobs_run_at_once_than_cores_are_given(tmp_path, option):
     (tmp_path / "Snakefile").write_text(
         "rule all:\n    input: expand('{n}', n=range(2))\n"
