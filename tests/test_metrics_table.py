@@ -1,0 +1,256 @@
+"""metrics.csv: a row for each run, what is refused of it, and metrics of the user's own."""
+
+import re
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.config.section import ConfigError, check
+from mace_rl.results import metrics as m
+from mace_rl.results.records import RecordError
+from tests.test_metrics import CONFIG, SETTINGS, frame, noisy
+
+ROOT = Path(__file__).parents[1]
+ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
+    "env": "CartPole-v1",
+    "variant": "ppo",
+    "seed": 4,
+    "episodes": 1000,
+    "env_steps": 9000,
+    "final_return": 500.0,
+    "sample_efficiency": 201,
+    "convergence_steps": 295,  # the slope has come down from 480 / 50 to a tenth of that
+    "area_under_curve": 404.0,
+    "early_return": 20.0,
+    "solved": 1.0,
+    "sample_efficiency_common": 230,  # 22.1 + 0.75 · 377.9 = 305.5: 30 of 50 episodes at 500
+    "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
+    "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
+    "convergence_steps_steepest": 300,  # both windows of 50 at 500: episodes 201 to 300
+    "convergence_steps_flattest": 100,
+    "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
+    "sample_efficiency_censored": 0,
+    "convergence_steps_censored": 0,
+    "sample_efficiency_common_censored": 0,
+    "sample_efficiency_range_censored": 0,
+    "convergence_steps_range_censored": 0,
+    "convergence_steps_steepest_censored": 0,
+    "convergence_steps_flattest_censored": 0,
+    "convergence_steps_public_code_censored": 0,
+}
+COLUMNS = list(ROW)
+ENVIRONMENTS, VARIANTS, SEEDS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_full"], [3, 1]
+WANTED = list(product(ENVIRONMENTS, VARIANTS, SEEDS))
+
+
+def runs():
+    return {
+        run: frame(noisy(i) - 300 * (run[0] == "Acrobot-v1"), length=7)
+        for i, run in enumerate(product(ENVIRONMENTS, VARIANTS, SEEDS))
+    }
+
+
+def table(**changed):
+    return m.metrics_table(**{"runs": runs(), "wanted": WANTED, "settings": CONFIG} | changed)
+
+
+def test_a_row_holds_each_metric_under_its_name():
+    returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
+    row = m.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    assert row == ROW
+    assert list(row) == COLUMNS
+
+
+def test_the_table_is_in_the_configured_order_and_counts_censored_runs():
+    result = table()
+    found = list(zip(result["env"], result["variant"], result["seed"], strict=True))
+    assert found == WANTED
+    assert not result.isna().any(axis=None)
+    acrobot = result[result["env"] == "Acrobot-v1"]
+    assert (acrobot["sample_efficiency_censored"] == 1).all()  # the bar is above the final return
+    assert (acrobot["sample_efficiency"] == 400).all()
+
+
+def test_a_missing_run_is_an_error_and_never_a_smaller_n():
+    fewer = runs()
+    del fewer["Acrobot-v1", "ppo", 1]
+    with pytest.raises(RecordError, match="the run Acrobot-v1, ppo, seed 1 is missing"):
+        table(runs=fewer)
+    with pytest.raises(RecordError, match="seed 1 in the records is not in the configuration"):
+        table(wanted=[run for run in WANTED if run[2] == 3])
+    shorter = runs()
+    shorter["Acrobot-v1", "ppo", 1] = frame(noisy(0, 399))
+    with pytest.raises(RecordError, match=r"Acrobot-v1, ppo have different .* \[399, 400\]"):
+        table(runs=shorter)
+
+
+def change(row, column, value):
+    def damage(lines):
+        cells = lines[row].split(",")
+        cells[COLUMNS.index(column)] = value
+        lines[row] = ",".join(cells)
+
+    return damage
+
+
+DAMAGE = {
+    "a run lost": (lambda lines: lines.pop(3), "mace_full, seed 3 is missing"),
+    "a run twice": (lambda lines: lines.append(lines[1]), "seed 3 stands more than once"),
+    "rows swapped": (lambda lines: lines.insert(1, lines.pop(2)), "line 2: .*seed 1 stands where"),
+    "another seed": (change(8, "seed", "7"), "seed 1 is missing"),
+    "another variant": (change(1, "variant", "ppO"), "ppo, seed 3 is missing"),
+    "a column lost": (lambda lines: lines.__setitem__(0, lines[0][:-9]), "line 1: the column"),
+    "NaN": (change(5, "final_return", "nan"), "line 6: final_return is 'nan'"),
+    "empty": (change(5, "convergence_steps", ""), "line 6: convergence_steps is ''"),
+    "episode 0": (change(5, "sample_efficiency", "0"), "line 6: sample_efficiency is 0 of 400"),
+    "beyond E": (change(2, "sample_efficiency", "401"), "line 3: sample_efficiency is 401 of 400"),
+    "a flag of 2": (change(2, "convergence_steps_censored", "2"), "line 3: convergence_steps"),
+    "a flag too much": (change(2, "sample_efficiency_censored", "1"), "line 3: sample_efficiency"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
+    spoil, named = DAMAGE[damage]
+    path = tmp_path / "metrics.csv"
+    lines = table().to_csv(index=False).splitlines()
+    spoil(lines)
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordError, match=named) as refusal:
+        m.read_metrics(path, WANTED, CONFIG)
+    assert str(path) in str(refusal.value)
+
+
+# metrics of the user's own
+
+
+@pytest.fixture
+def custom(monkeypatch):
+    """`custom(*metrics)`: the settings with these, as if this file were the user's."""
+
+    def make(*metrics):
+        names = [f"OWN_{number}" for number in range(len(metrics))]
+        for name, metric in zip(names, metrics, strict=True):
+            monkeypatch.setattr(sys.modules[__name__], name, metric, raising=False)
+        references = [f"{__name__}:{name}" for name in names]
+        return check(MetricsConfig, SETTINGS | {"custom": references}, "test")
+
+    return make
+
+
+def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
+    settings = custom(
+        m.Metric("positive", "Positive", "episodes", lambda curve: curve.first(curve.returns > 0)),
+        m.Metric("worst", "Worst", "return", lambda curve: curve.returns.min()),
+    )
+    result = table(settings=settings)
+    added = ["positive", "worst", "positive_censored"]
+    assert list(result.columns) == [*COLUMNS[:17], *added[:2], *COLUMNS[17:], added[2]]
+    pd.testing.assert_frame_equal(result[COLUMNS], table())
+    for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
+        returns = run["extrinsic_return"].tolist()
+        first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
+        assert tuple(row) == (first or 400, min(returns), first is None)
+    result.to_csv(tmp_path / "metrics.csv", index=False)
+    read = m.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
+    pd.testing.assert_frame_equal(read, result, check_exact=True)
+    with pytest.raises(RecordError, match="line 1: the column 'positive'"):
+        m.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("own", "problem"),
+    [
+        (3, "is no mace_rl.results.metrics.Metric but of type int"),
+        (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
+        (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
+        (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
+        (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
+        (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
+    ],
+)
+def test_what_is_no_metric_is_refused(own, problem, custom):
+    refusal = rf"metrics\.custom has '{__name__}:OWN_1', which .*{problem}"
+    with pytest.raises(ConfigError, match=refusal):
+        m.all_metrics(custom(m.Metric("x_censored", "X", "return", min), own))
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "error", "problem"),
+    [
+        ("return", np.nan, ConfigError, "is nan, but should be a finite number"),
+        ("return", m.Episode(1, False), ConfigError, "but should be a finite number"),
+        ("episodes", 3.5, ConfigError, r"x of the run CartPole-v1, ppo, seed 3 is 3\.5, but"),
+        ("episodes", m.Episode(0, False), RecordError, "x is 0 of 400 episodes"),
+        ("episodes", m.Episode(9, True), RecordError, "x is 9 of 400 episodes with x_censored = 1"),
+    ],
+)
+def test_what_no_metric_can_be_is_refused(unit, value, error, problem, custom):
+    with pytest.raises(error, match=problem):
+        table(settings=custom(m.Metric("x", "X", unit, lambda curve: value)))
+
+
+REFUSED = {
+    "final_fraction": (0, 1.1),
+    "threshold": (1.0,),
+    "moving_average": (0, 50.5),
+    "convergence_band": (-0.1,),
+    "confidence": (95,),
+    "bootstrap_repetitions": (99,),
+    "bootstrap_seed": (-1,),
+    "convergence_slope": (-0.1, 1.0),
+    "regret": ({"variant": "mace_full", "constants": []},),
+    "random_return": (22.1, *({"CartPole-v1": value} for value in (np.nan, np.inf, "22", True))),
+    "custom": (["own_metrics.POSITIVE"], ["own metrics:POSITIVE"]),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_setting_that_cannot_be_is_refused(key):
+    for value in REFUSED[key]:
+        with pytest.raises(ConfigError, match=rf"test: {key}(\.CartPole-v1|\.0|\.constants)? is "):
+            check(MetricsConfig, SETTINGS | {key: value}, "test")
+
+
+def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
+    def names(environments, **changes):
+        settings = check(MetricsConfig, SETTINGS | changes, "test").within(environments, ["ppo"])
+        return [metric.name for metric in m.all_metrics(settings) if metric.needs]
+
+    assert names(ENVIRONMENTS) == ["solved", "sample_efficiency_common"]
+    assert names(["CartPole-v1", "Other-v0"]) == []
+    assert names(ENVIRONMENTS, solved_return={"CartPole-v1": 475.0}) == ["sample_efficiency_common"]
+    assert names(["CartPole-v1"], reference_return={}) == ["solved"]
+    columns = table(settings=CONFIG.within([*ENVIRONMENTS, "Other-v0"], VARIANTS)).columns
+    assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (
+            {"solved_return": {"CartPole-v1": 22.1}},
+            r"metrics\.solved_return\.CartPole-v1 is 22\.1, but should be greater than .*, 22\.1",
+        ),
+        (
+            {"regret": {"variant": "mace_full", "constants": ["ppo", "beta_0.1"]}},
+            r"metrics\.regret has 'beta_0\.1', which is not in variants",
+        ),
+    ],
+)
+def test_what_does_not_fit_the_study_is_refused(change, problem):
+    with pytest.raises(ConfigError, match=problem):
+        check(MetricsConfig, SETTINGS | change, "test").within(ENVIRONMENTS, VARIANTS)
+
+
+def test_every_metric_is_in_the_documentation():
+    text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)`.*?\| (\w+) \|", text, re.MULTILINE)
+    units = {"episodes": "episode"}
+    listed = {metric.name: units.get(metric.unit, metric.unit) for metric in m.METRICS}
+    assert listed.items() <= dict(rows).items()
