@@ -10,14 +10,17 @@ page of one study is made, and not compared.
 """
 
 import argparse
+import multiprocessing.connection
 import os
 import shutil
-import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import gymnasium  # noqa: F401 - what workflow/rules/study.smk imports, imported once
+import snakemake.cli
+
+import mace_rl.config.study  # noqa: F401 - likewise
 from mace_rl.config.reading import read_yaml
 from tools import archive
 
@@ -33,17 +36,47 @@ RULES = (
 
 
 def make(name: str, study: dict[str, Any]) -> None:
-    """Make the `outputs` of one study; exits with what Snakemake says if it cannot."""
+    """Make the `outputs` of one study and end this process, with 1 if Snakemake cannot.
+
+    What it says is in `log_of(name)`.
+    """
     folder = MADE / name
     folder.mkdir(parents=True)
+    with log_of(name).open("wb") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
     (folder / "runs").symlink_to("../runs", target_is_directory=True)
-    command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
-    command += ["--allowed-rules", *RULES, "--configfile", *study["configfiles"]]
+    command = ["--cores", "1", "--quiet", "all", "--allowed-rules", *RULES]
+    command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"tables: {name}: {done.stderr.strip()}")
+    sys.argv = ["snakemake", *command]  # where profiles/default looks for --cores
+    snakemake.cli.main(command)
+
+
+def make_all(studies: dict[str, Any]) -> None:
+    """Make the outputs of every study, as many studies at once as there are cores.
+
+    Each in a process forked from this one: Snakemake's imports take longer than most of them.
+    """
+    fork = multiprocessing.get_context("fork")
+    waiting = [(name, fork.Process(target=make, args=(name, studies[name]))) for name in studies]
+    running: dict[Any, tuple[str, Any]] = {}  # by what is ready when the process ends
+    while waiting or running:
+        while waiting and len(running) < len(os.sched_getaffinity(0)):
+            name, process = waiting.pop(0)
+            process.start()
+            running[process.sentinel] = name, process
+        for ended in multiprocessing.connection.wait(list(running)):
+            name, process = running.pop(ended)
+            process.join()
+            if process.exitcode:
+                sys.exit(f"tables: {name}: {log_of(name).read_text(encoding='utf-8').strip()}")
+
+
+def log_of(name: str) -> Path:
+    """The file of what Snakemake says about a study."""
+    return MADE / name / "snakemake.log"
 
 
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
@@ -76,11 +109,10 @@ def main() -> None:
     shutil.rmtree(MADE, ignore_errors=True)
     runs = archive.unpack(KEPT, MADE)
     if only:
-        make(only, {**studies[only], "outputs": [PAGE]})
+        make_all({only: {**studies[only], "outputs": [PAGE]}})
         print(MADE / only / PAGE)
         return
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(make, studies, studies.values()))
+    make_all(studies)
     outputs = {name: study["outputs"] for name, study in studies.items()}
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))

@@ -148,7 +148,10 @@ def read_table(path: str | Path, columns: Mapping[str, type]) -> "pd.DataFrame":
         )
         numbers = [name for name, kind in columns.items() if kind is not str]
         in_bounds = all((frame[name].abs() < _BOUND[columns[name]]).all() for name in numbers)
-        if in_bounds and frame.to_csv(index=False, quoting=csv.QUOTE_NONE).encode() == content:
+        # What `frame.to_csv` gives too, in twice the time.
+        cells = (map(str, frame[name].tolist()) for name in columns)
+        rows = map(",".join, zip(*cells, strict=True))
+        if in_bounds and "\n".join([",".join(columns), *rows, ""]).encode() == content:
             return frame
     except (ValueError, OverflowError, csv.Error):
         pass  # of the first line that is wrong, below
