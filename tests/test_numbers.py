@@ -11,7 +11,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from tests.test_claims import table
-from tools import bonus_share, printed, show
+from tools import archive, bonus_share, meta_signal, printed, show
 
 ROOT = Path(__file__).parents[1]
 
@@ -130,6 +130,40 @@ def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
         shares = [scale * n / 100 for n in range(20)]  # 0.00, 0.01; …; 0.18, 0.19, times scale
         pd.DataFrame({"bonus_share": shares}).to_csv(run / "diagnostics.csv", index=False)
     bonus_share.main(tmp_path, ["beta_1", "beta_2"])
-    assert capsys.readouterr().out.splitlines()[-1] == "| A-v0 | 0.01 / 0.37 |  |"
+    measured = capsys.readouterr().out
+    assert measured.splitlines() == ["env,variant,seeds,first,last", "A-v0,beta_1,2,0.0100,0.3700"]
+    (tmp_path / "bonus_share.csv").write_text(measured + "B-v0,beta_2,2,0.5,0.25\n")
+    assert show.shares(tmp_path) == [
+        "| | seeds | beta_1 | beta_2 |",
+        "|---|---|---|---|",
+        "| A-v0 | 2 | 0.01 / 0.37 |  |",
+        "| B-v0 | 2 |  | 0.50 / 0.25 |",
+    ]
     with pytest.raises(SystemExit, match=r"no diagnostics\.csv of beta_2"):
         bonus_share.main(tmp_path, ["beta_2"])
+
+
+def test_the_last_betas_are_in_order_of_size(tmp_path: Path) -> None:
+    """20 episodes: those of the last two count."""
+    content = {}
+    for seed, last in enumerate((0.5, 0.2)):
+        frame = pd.DataFrame({"beta": [1.0] * 18 + [last, last + 0.1]})
+        content[f"seed{seed}/episodes.csv"] = frame.to_csv(index=False).encode()
+        content[f"seed{seed}/run.json"] = b"{}"
+    archive.write(tmp_path / "A-v0" / "mace_full.tar.xz", content)
+    assert show.betas(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.25, 0.55 |"]
+
+
+def test_what_is_measured_of_the_credit_of_beta(tmp_path: Path) -> None:
+    """A short training: every measure of each third, beside those of another environment."""
+    file = tmp_path / "meta_signal.csv"
+    other = {"env": "A-v0", "episodes": 7, "seeds": 2, "measure": "unscaled", "third": [1, 2, 3]}
+    pd.DataFrame(other | {"value": [-0.25, 0, 0.5]}).to_csv(file, index=False)
+    for _ in range(2):  # the second time its rows are replaced
+        meta_signal.main(file, "DeepSea10-v0", 500, 1, ["config/exploration.yaml"])
+    table = pd.read_csv(file)
+    assert len(table) == 3 + 6 * 3
+    cosines = table[table["measure"] == "cosine, as Adam steps"]["value"]
+    assert ((cosines > 0.2) & (cosines <= 1)).all()
+    assert "| A-v0, 7 | 2 | −0.25 / 0.00 / 0.50 |  |" in show.signals(tmp_path)[2]
+    assert show.signals(tmp_path)[3].startswith("| DeepSea10-v0, 500 | 1 | ")

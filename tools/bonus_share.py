@@ -1,9 +1,10 @@
-"""Print the bonus's share of the total advantage: of the first tenth of the updates / of the last.
+"""Measure the bonus's share of the total advantage in the first and last tenth of the updates.
 
-    .venv/bin/python -m tools.bonus_share RUNS VARIANT ...
+    .venv/bin/python -m tools.bonus_share RUNS VARIANT ... > reference/measured/bonus_share.csv
 
-RUNS is a folder of runs, such as results/controls/runs; a line for each environment, a cell for
-each variant: means over seeds.
+RUNS is a folder of runs, such as results/controls/runs, with their diagnostics.csv, which
+reference/study does not keep. A row for each environment and variant, means over seeds;
+`tools.show shares reference/measured` prints them as a table.
 """
 
 import argparse
@@ -22,19 +23,18 @@ def first_and_last(diagnostics: Path) -> tuple[float, float]:
 
 
 def main(runs: Path, variants: list[str]) -> None:
-    """Print the table as Markdown; exits with one line if there is nothing to print."""
-    if not any(any(runs.glob(f"*/{variant}/seed*/diagnostics.csv")) for variant in variants):
-        sys.exit(f"bonus_share: {runs} has no diagnostics.csv of {', '.join(variants)}")
-    print(f"| | {' | '.join(variants)} |")
-    print("|---" * (1 + len(variants)) + "|")
-    for environment in sorted(path for path in runs.iterdir()):
-        cells = []
+    """Print the rows as CSV; exits with one line if there are none."""
+    rows = []
+    for environment in sorted(runs.glob("*")):
         for variant in variants:
             found = sorted((environment / variant).glob("seed*/diagnostics.csv"))
-            means = np.mean([first_and_last(path) for path in found], axis=0) if found else []
-            cells.append(" / ".join(f"{value:.2f}" for value in means))
-        if any(cells):
-            print(f"| {environment.name} | {' | '.join(cells)} |")
+            if found:
+                first, last = np.mean([first_and_last(path) for path in found], axis=0)
+                rows.append((environment.name, variant, len(found), first, last))
+    if not rows:
+        sys.exit(f"bonus_share: {runs} has no diagnostics.csv of {', '.join(variants)}")
+    table = pd.DataFrame(rows, columns=["env", "variant", "seeds", "first", "last"])
+    print(table.to_csv(index=False, float_format="%.4f"), end="")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """How much of β's credit is signal, for each objective tried, and how well it knows the update.
 
-    .venv/bin/python -m tools.meta_signal ENVIRONMENT EPISODES SEEDS [CONFIG ...]
+    .venv/bin/python -m tools.meta_signal FILE ENVIRONMENT EPISODES SEEDS [CONFIG ...]
 
-Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and prints, for each third of
+Trains SEEDS runs (tuning seeds, from 1000) at a constant β of 0.4 and measures, for each third of
 training: the signal-to-noise ratio per update of each objective, mean over standard deviation over
 updates and seeds; and the cosine between the direction that credit is given along and what a
 little more β really does to the policy's weights, by finite differences through the whole update.
-`docs/method.md` explains the objectives.
+`docs/method.md` explains the objectives. The rows replace those of the environment in FILE (CSV),
+which is reference/measured/meta_signal.csv for `tools.show signals`.
 """
 
 import argparse
@@ -15,6 +16,7 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from threadpoolctl import threadpool_limits
 
@@ -33,6 +35,7 @@ from mace_rl.experience import (
     total_advantages,
 )
 from mace_rl.factories import beta_controller
+from mace_rl.files import write_atomically
 from mace_rl.streams import Streams
 from mace_rl.train import Trainer
 
@@ -108,8 +111,8 @@ class Probe(Trainer):
         return (ends[0] - ends[1]) / (2 * STEP)
 
 
-def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> None:
-    """Print the table."""
+def main(file: Path, environment: str, episodes: int, seeds: int, overlays: list[str]) -> None:
+    """Measure one environment, and put its rows into `file`."""
     config = read_yaml(Path("config.yaml"))
     for overlay in overlays:
         config = merge(config, read_yaml(Path(overlay)))
@@ -126,23 +129,28 @@ def main(environment: str, episodes: int, seeds: int, overlays: list[str]) -> No
         judge = beta_controller(settings, probe.environment, Streams(seed))
         assert isinstance(judge, MetaAdaptation)
         runs.append(probe.measure(judge))
-    print(f"{environment}, {seeds} seeds, β = {BETA}")
+    rows = []
     updates = min(len(run["unscaled"]) for run in runs)
-    for part in np.array_split(np.arange(updates), 3):
-        cells = []
-        for name in runs[0]:
+    for name in runs[0]:
+        for third, part in enumerate(np.array_split(np.arange(updates), 3), start=1):
             values = np.array([np.array(run[name])[part] for run in runs])
             values = values[np.isfinite(values)]
-            shown = values.mean() if "cosine" in name else values.mean() / (values.std() or 1.0)
-            cells.append(f"{name} {shown:.2f}")
-        print(f"updates {part[0] + 1} to {part[-1] + 1}: " + ", ".join(cells))
+            value = values.mean() if "cosine" in name else values.mean() / (values.std() or 1.0)
+            rows.append((environment, episodes, seeds, name, third, value))
+    table = pd.DataFrame(rows, columns=["env", "episodes", "seeds", "measure", "third", "value"])
+    if file.exists():
+        others = pd.read_csv(file)
+        table = pd.concat([others[others["env"] != environment], table])
+    write_atomically(file, table.to_csv(index=False, float_format="%.4f"))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog="example: python -m tools.meta_signal DeepSea10-v0 3000 4 config/exploration.yaml",
+        epilog="example: python -m tools.meta_signal signal.csv DeepSea10-v0 3000 4"
+        " config/exploration.yaml",
     )
+    parser.add_argument("file", type=Path, help="where the rows go")
     parser.add_argument("environment")
     parser.add_argument("episodes", type=int)
     parser.add_argument("seeds", type=int, help="how many, from 1000")
@@ -150,4 +158,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     with threadpool_limits(1):
-        main(arguments.environment, arguments.episodes, arguments.seeds, arguments.configs)
+        main(
+            *(arguments.file, arguments.environment, arguments.episodes),
+            *(arguments.seeds, arguments.configs),
+        )

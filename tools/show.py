@@ -2,7 +2,8 @@
 
     .venv/bin/python -m tools.show WHAT FOLDER [...]
 
-FOLDER is one of reference/tables, or the results of any study. WHAT is one of
+FOLDER is one of reference/tables, or the results of any study; of the last three reference/study
+and reference/measured. WHAT is one of
 
     headline    what holds, in two sentences                                       (claims.json)
     ledger      a verdict for each claim                                           (claims.json)
@@ -18,9 +19,13 @@ FOLDER is one of reference/tables, or the results of any study. WHAT is one of
                 OTHER ...`, NAMEs of folders beside FOLDER                         (metrics.csv)
     aggregate   scores between random and the best run, all environments          (aggregate.csv)
     readings    Table 1 under every reading                                         (readings.md)
+    betas       the learnt β at the end of training: `betas FOLDER ENVIRONMENT ...`   (kept runs)
+    shares      the bonus's share of the advantages, by β                       (bonus_share.csv)
+    signals     signal and noise of the credit of β                             (meta_signal.csv)
 """
 
 import argparse
+import io
 import json
 import sys
 from collections import Counter
@@ -31,10 +36,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from mace_rl import files
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.claims import LITERAL, ROBUST, digits_of
+from mace_rl.results.metrics import final_return
+from mace_rl.results.paper import FULL
 from mace_rl.results.statistics import mean_interval, probability_of_improvement
+from tools import archive
 
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = MetricsConfig.model_validate(read_yaml(ROOT / "config.yaml")["metrics"])
@@ -248,6 +257,47 @@ def readings(folder: Path) -> list[str]:
     return (folder / "readings.md").read_text(encoding="utf-8").splitlines()
 
 
+def betas(folder: Path, *environments: str) -> list[str]:
+    """The mean β of the last tenth of the episodes, of each seed, in order of size."""
+    lines = ["| | seeds | β at the end |", "|---|---|---|"]
+    for environment in environments:
+        kept = archive.read(folder / environment / f"{FULL}.tar.xz")
+        found = sorted(
+            final_return(pd.read_csv(io.BytesIO(kept[name]))["beta"].to_numpy(), 0.1)
+            for name in kept
+            if name.endswith(files.EPISODES)
+        )
+        numbers = ", ".join(f"{beta:.2f}" for beta in found)
+        lines.append(f"| {environment} | {len(found)} | {numbers} |")
+    return lines
+
+
+def shares(folder: Path) -> list[str]:
+    """The share in the first tenth of the updates / in the last, by variant."""
+    table = pd.read_csv(folder / "bonus_share.csv")
+    variants = list(table["variant"].unique())
+    lines = [f"| | seeds | {' | '.join(variants)} |", "|---" * (2 + len(variants)) + "|"]
+    for environment, rows in table.groupby("env", sort=False):
+        found = {row.variant: f"{row.first:.2f} / {row.last:.2f}" for row in rows.itertuples()}
+        cells = " | ".join(found.get(variant, "") for variant in variants)
+        lines.append(f"| {environment} | {rows['seeds'].min()} | {cells} |")
+    return lines
+
+
+def signals(folder: Path) -> list[str]:
+    """Each measure of `tools.meta_signal` in the first / second / last third of training."""
+    table = pd.read_csv(folder / "meta_signal.csv")
+    measures = list(table["measure"].unique())
+    lines = [f"| | seeds | {' | '.join(measures)} |", "|---" * (2 + len(measures)) + "|"]
+    for (environment, episodes, seeds), rows in table.groupby(
+        ["env", "episodes", "seeds"], sort=False
+    ):
+        found = {name: rows.loc[rows["measure"] == name, "value"] for name in measures}
+        cells = [" / ".join(_number(value, 2) for value in found[name]) for name in measures]
+        lines.append(f"| {environment}, {episodes} | {seeds} | {' | '.join(cells)} |")
+    return lines
+
+
 def _claims(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "claims.json").read_text(encoding="utf-8")))
 
@@ -292,7 +342,7 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
     function.__name__: function
     for function in (
         *(headline, ledger, parts, table1, means, solved, constants, regret, improvement),
-        *(finals, together, aggregate, readings),
+        *(finals, together, aggregate, readings, betas, shares, signals),
     )
 }
 
