@@ -11,7 +11,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from tests.test_claims import table
-from tools import archive, bonus_share, meta_signal, printed, show
+from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed, show
 
 ROOT = Path(__file__).parents[1]
 
@@ -52,6 +52,20 @@ def test_the_study_page_has_no_number_of_its_own() -> None:
     text = printed.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
+
+
+@pytest.mark.slow
+def test_the_metrics_page_says_what_the_simulations_print(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (ROOT / "docs/metrics.md").read_text(encoding="utf-8")
+    coverage.main(2000)
+    assert "\n\n" + capsys.readouterr().out + "\n" in page
+    monkeypatch.setattr("sys.argv", ["convergence_simulation"])
+    convergence_simulation.main()
+    rows = [line.removesuffix("|") for line in capsys.readouterr().out.splitlines()[2:]]
+    shown = [line for line in page.splitlines() if line.startswith(tuple(rows))]
+    assert len(rows) == len(shown) > 10, "the page has columns of real runs beside them"
 
 
 def write(frame: pd.DataFrame, folder: Path) -> Path:
