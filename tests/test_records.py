@@ -1,6 +1,7 @@
 """The contract of episodes.csv: it comes back to the bit, and what is damaged is refused."""
 
 import csv
+import hashlib
 import os
 
 import numpy as np
@@ -118,6 +119,21 @@ def test_a_damaged_file_is_refused_with_its_line(damage, tmp_path):
     assert message.startswith(f"{path}: {line}")
     assert named in message
     assert "\n" not in message
+
+
+def test_what_run_json_does_not_describe_is_refused(tmp_path):
+    """Plausible, but altered; and where the damage has a line, that is named."""
+    path = tmp_path / "e.csv"
+    path.write_text(text())
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert read_episodes(path, 3, digest).equals(read_episodes(path, 3))
+    path.write_text(text().replace("9.5", "9.75"))
+    assert len(read_episodes(path, 3)) == 3
+    with pytest.raises(RecordError, match=r"e\.csv: not the file that run\.json describes"):
+        read_episodes(path, 3, digest)
+    path.write_text(text().replace("9.5", "x"))
+    with pytest.raises(RecordError, match="line 2: extrinsic_return is 'x'"):
+        read_episodes(path, 3, digest)
 
 
 def test_every_cut_is_refused(tmp_path):

@@ -3,7 +3,8 @@
 
 rule curves:
     input:
-        EPISODES,
+        episodes=EPISODES,
+        records=RECORDS,
     output:
         curves=report(
             f"{RESULTS}/figure{{number}}.csv", caption="../report/curves.rst", category="Results"
@@ -94,7 +95,8 @@ if REGRET:
 
 rule readings:
     input:
-        EPISODES,
+        episodes=EPISODES,
+        records=RECORDS,
     output:
         table=f"{RESULTS}/readings.csv",
         markdown=report(

@@ -11,7 +11,8 @@ except ConfigError as error:
 
 rule metrics:
     input:
-        EPISODES,
+        episodes=EPISODES,
+        records=RECORDS,
     output:
         f"{RESULTS}/metrics.csv",
     log:

@@ -7,14 +7,11 @@ with job("readings", snakemake.log[0]):
     from mace_rl.files import write_atomically
     from mace_rl.results.figures import save_figure
     from mace_rl.results.readings import draw_readings, markdown, readings
-    from mace_rl.results.records import read_episodes
+    from mace_rl.runs.finished import read_runs
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    frames = {
-        (env, variant, seed): read_episodes(path, episodes)
-        for path, (env, variant, seed, episodes) in zip(snakemake.input, params.runs, strict=True)
-    }
+    frames = read_runs(snakemake.input.records, params.runs)
     table = readings(frames, settings)
     write_atomically(output.table, table.to_csv(index=False))
     write_atomically(output.markdown, markdown(table, settings))
