@@ -28,10 +28,10 @@ from mace_rl import sources
 from mace_rl.config.reading import merge, merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.finite import NonFiniteError
-from mace_rl.results.records import read_episodes
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.evaluate import evaluate
+from mace_rl.runs.finished import read_runs
 from mace_rl.train import Trainer
 
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
@@ -450,7 +450,9 @@ def finished(run_config, tmp_path_factory):
 
 def test_the_tables_hold_the_records_to_the_bit(finished):
     trainer = finish(finished.config)
-    frame = read_episodes(finished.directory / "episodes.csv", 5)
+    record = str(finished.directory / "run.json")
+    frames = read_runs([record], [("CartPole-v1", "mace_full", 0, 5)])
+    frame = frames["CartPole-v1", "mace_full", 0]
     assert frame.to_dict("records") == [vars(record) for record in trainer.records]
     frame = pd.read_csv(finished.directory / "diagnostics.csv")
     expected = [vars(record) for record in trainer.diagnostics]
