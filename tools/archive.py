@@ -78,7 +78,7 @@ def unpack(archives: Path, results: Path) -> int:
         content = read(archive)
         for name, data in content.items():
             (variant / name).parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(variant / name, data)
+            (variant / name).write_bytes(data)  # half of it would not be what run.json describes
         return sum(name.endswith(files.RECORD) for name in content)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
