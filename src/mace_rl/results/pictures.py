@@ -143,7 +143,7 @@ def draw_regret(
             means = runs.groupby("variant")["area_under_curve"].mean()[regret.constants]
             ticks = [labels[name].removeprefix("β = ").partition(" (")[0] for name in means.index]
             axes.plot(range(len(means)), means, color="dimgray", linewidth=0.8)
-            axes.set_xticks(range(len(means)), ticks)
+            axes.set_xticks(range(len(means)), ticks, rotation=45)  # "PPO" runs into its neighbour
             axes.set_title(environment)
             axes.set_xlabel("constant β")
         for axes in panels[len(environments) :]:
