@@ -5,6 +5,7 @@ their means over the seeds and the differences, with 95 % intervals.
 """
 
 import argparse
+import sys
 
 import mace_rl  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
 
@@ -41,8 +42,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10, help="how many, default: %(default)s")
     parser.add_argument("--first-seed", type=int, default=0, help="default: %(default)s")
     arguments = parser.parse_args()
-    if arguments.seeds < 1 or arguments.steps < 1 or arguments.first_seed < 0:
-        parser.error("--seeds and --steps should be at least 1, --first-seed at least 0")
+    for option, least in {"steps": 1, "seeds": 1, "first_seed": 0}.items():
+        value = getattr(arguments, option)
+        if value < least:
+            name = option.replace("_", "-")
+            parser.error(f"--{name} is {value}, but should be at least {least}")
+    try:
+        gymnasium.make(arguments.environment).close()
+    except (gymnasium.error.Error, ImportError) as error:
+        reason = " ".join(str(error).split())
+        sys.exit(f"sb3_ppo: --environment {arguments.environment!r} cannot be made: {reason}")
     torch.set_num_threads(1)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     found = np.empty((len(MEASURES), 2, len(seeds)))  # without and with curiosity

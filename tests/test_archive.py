@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from mace_rl import files
 from mace_rl.runs.provenance import KEYS
-from tools import archive
+from tools import archive, tables
 
 
 def make_run(folder: Path, text: str) -> None:
@@ -64,3 +65,28 @@ def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
     (run / files.AGENT).write_text("another")
     with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
         archive.pack(tmp_path / "results", tmp_path / "kept")
+
+
+@pytest.mark.parametrize("command", ["pack", "unpack"])
+@pytest.mark.parametrize("folder", ["nope", "without a finished run"])
+def test_where_there_are_no_runs_nothing_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, folder: str
+) -> None:
+    origin, goal = tmp_path / folder, tmp_path / "goal"
+    (tmp_path / "without a finished run/runs/A-v1/ppo/seed0").mkdir(parents=True)
+    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", "1\n")
+    archive.pack(tmp_path / "results", goal)  # what is there already does not count
+    before = content(tmp_path)
+    wanted = {"pack": "runs/ENV/VARIANT/seedN/run.json", "unpack": "ENV/VARIANT.tar.xz"}[command]
+    monkeypatch.setattr("sys.argv", ["archive", command, str(origin), str(goal)])
+    with pytest.raises(SystemExit) as ended:
+        archive.main()
+    assert ended.value.code == f"archive: {origin}: no {wanted} in it"
+    assert content(tmp_path) == before
+
+
+def test_the_example_packs_where_the_tables_are_made_from() -> None:
+    packed, unpacked = re.findall(
+        r"(?m)^    \S+ -m tools\.archive .* (\S+) (\S+)$", archive.__doc__
+    )
+    assert Path(packed[1]) == Path(unpacked[0]) == tables.KEPT

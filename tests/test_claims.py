@@ -1,6 +1,11 @@
 """The verdicts on the paper's claims, from tables in which the truth is known."""
 
 import itertools
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,6 +17,7 @@ from mace_rl.results import claims
 from mace_rl.results.claims import CLAIMS, CORRELATION, LITERAL, ROBUST
 from mace_rl.results.statistics import paired_comparison, stratified_comparison
 
+ROOT = Path(__file__).parents[1]
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
 LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
 
@@ -88,6 +94,7 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     gain = runs["ppo"] - runs["mace_full"]  # fewer episodes are the improvement
     assert part["difference"] == pytest.approx(gain.mean())
     assert part["worth_mentioning"] == 100
+    assert part["in_paper"] == 186 - 249  # of its Table 1: the learned β is the later one
     error = gain.std() / np.sqrt(12)
     t = scipy.stats.t(11)
     assert part["detectable"] == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * error)
@@ -96,6 +103,34 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     assert part["probability"] == pytest.approx(wins + ties / 2)
     # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
     assert part["p_value"] <= part["p_holm"] <= min(1, 24 * part["p_value"])
+
+
+def test_one_seed_has_estimates_but_no_tests_and_decides_nothing(study: Study) -> None:
+    frame = table(1, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
+    assert set(verdicts(frame, study).values()) == {("inconclusive", "inconclusive")}
+    records = json.loads(claims.as_json(claims.ledger(frame, study.metrics), cost={}))["claims"]
+    part = records[0][ROBUST]["parts"][0]
+    runs = frame[frame["env"] == "Acrobot-v1"].set_index("variant")["sample_efficiency_common"]
+    assert part["difference"] == runs["ppo"] - runs["mace_full"]
+    assert {part[name] for name in ("low", "high", "p_value", "p_holm", "detectable")} == {None}
+    assert part["outcome"] == "open"
+    assert f"| {part['difference']:.0f} (– to –) | – |" in claims.markdown(records, "one seed")
+
+
+@pytest.mark.slow
+def test_the_documented_study_of_one_seed_gets_its_ledger(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "reference" / "runs", tmp_path / "runs")
+    command = "-m snakemake --cores 1 --allowed-rules metrics claims"
+    command += f" --configfile config/reference.yaml --config results={tmp_path}"
+    subprocess.run(
+        [sys.executable, *command.split(), "--", f"{tmp_path}/claims.json"],
+        check=True,
+        capture_output=True,
+        cwd=ROOT,
+    )
+    found = json.loads((tmp_path / "claims.json").read_text())
+    assert found["cost"]["runs"] == 9
+    assert {claim[ROBUST]["verdict"] for claim in found["claims"]} == {"inconclusive"}
 
 
 @pytest.mark.parametrize(

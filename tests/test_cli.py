@@ -4,12 +4,14 @@ import argparse
 import json
 import shlex
 import shutil
+import subprocess
 import sys
 
 import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from snakemake.utils import update_config
 
 from mace_rl import cli
 from mace_rl.config.section import ConfigError
@@ -37,6 +39,7 @@ MISTAKES = {
     "empty environment": ({"--env": ""}, ["''", "letters"]),
     "environment without a time limit": ({"--env": "CliffWalking-v1"}, ["time limit"]),
     "unknown variant": ({"--variant": "mace_ful"}, ["'mace_ful'", "'mace_full'"]),
+    "variant of a further study": ({"--variant": "beta_0.4"}, ["'beta_0.4'", "--config FILE"]),
     "empty variant": ({"--variant": ""}, ["''", "variant"]),
     "negative seed": ({"--seed": "-1"}, ["-1", "0"]),
     "seed beyond 32 bits": ({"--seed": "4294967296"}, ["4294967296"]),
@@ -70,6 +73,7 @@ MALFORMED = {
     "seed that is no integer": ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
     "episodes that are text": ["train", *sum(GOOD.items(), ()), "--out", "x", "--episodes", "1e3"],
     "option without value": ["train", "--env"],
+    "config without a file": ["train", *sum(GOOD.items(), ()), "--out", "x", "--config"],
     "unknown engine": ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
     "verify without folder": ["verify"],
     "evaluate without folder": ["evaluate", "--episodes", "3"],
@@ -131,6 +135,39 @@ def test_an_environment_is_made_as_the_config_says(
     rows = [row.split(",") for row in (out / "episodes.csv").read_text().splitlines()[1:]]
     assert all(int(row[2]) in lengths for row in rows)
     assert call(monkeypatch, "evaluate", str(out), "--episodes", "2") == (0, "")
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_several_files_are_read_over_each_other_in_order(tmp_path, repeated):
+    """Both ways of giving them are the same, and the later file wins."""
+    settings = {"first": "{max_episode_steps: 7, ppo: {epochs: 3}}", "second": "{ppo: {epochs: 2}}"}
+    for name, layer in settings.items():
+        text = f"environment_settings: {{FrozenLake-v1: {layer}}}"
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    for order, epochs in ((["first", "second"], 2), (["second", "first"], 3)):
+        config = config_of(*(tmp_path / name for name in order), repeated=repeated)
+        assert (config.max_episode_steps, config.ppo.epochs) == (7, epochs)
+
+
+@pytest.mark.parametrize("order", [("exploration", "controls"), ("controls", "exploration")])
+def test_runs_of_combined_studies_are_those_of_the_workflow(order):
+    """As Snakemake's own function reads the files over each other."""
+    paths = [cli.CONFIG.parent / "config" / f"{name}.yaml" for name in order]
+    merged = json.loads(json.dumps(CONFIG))
+    for path in paths:
+        update_config(merged, yaml.safe_load(path.read_text(encoding="utf-8")))
+    expected = load_study(merged, "some.yaml").run_config("DeepSea10-v0", "beta_0.4", 0)
+    options = {"--env": "DeepSea10-v0", "--variant": "beta_0.4"}
+    assert config_of(*paths, **options) == expected.model_copy(update={"episodes": 3})
+
+
+def config_of(*paths, repeated=False, **changes: str):
+    """The run that `mace-rl train` is asked for with these files, each behind its own --config."""
+    options = sum((GOOD | {"--env": "FrozenLake-v1", "--out": "x"} | changes).items(), ())
+    words = [word for path in paths for word in ("--config", str(path))]
+    if not repeated:
+        words = ["--config", *map(str, paths)]
+    return cli.run_config(cli.parser().parse_args(["train", *options, *words]))
 
 
 @pytest.mark.parametrize("name", MALFORMED)
@@ -233,6 +270,58 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     assert call(monkeypatch, "train", *options) == (0, "")
 
 
+DAMAGED = ["episodes.csv", "diagnostics.csv", "agent.pt"]
+OTHERS = {  # what is changed in run.json, and what the message has to name
+    "sources": ("", "other code, in mace_rl"),
+    "versions": ({"numpy": "1.0"}, "other versions (numpy was '1.0' and is '"),
+    "arithmetic": ({"blas": "Zen"}, "other arithmetic (blas was 'Zen' and is '"),
+}
+
+
+def test_results_that_are_damaged_or_of_other_code_are_not_this_run(monkeypatch, tmp_path, caplog):
+    caplog.set_level("INFO")
+    words = ["train", *sum((GOOD | {"--out": str(tmp_path)}).items(), ())]
+    assert call(monkeypatch, *words) == (0, "")
+    whole = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    caplog.clear()
+
+    def refused(*expected: str) -> None:
+        code, message = call(monkeypatch, *words)
+        assert code == 1 and "\n" not in message and str(tmp_path) in message
+        for fragment in (*expected, "choose another --out, or remove the folder"):
+            assert fragment in message
+
+    for name in DAMAGED:
+        (tmp_path / name).write_bytes(whole[name][:-1])
+        refused(name, "cut off")
+        (tmp_path / name).unlink()
+        refused(name, "missing")
+        (tmp_path / name).write_bytes(whole[name])
+    record = json.loads(whole["run.json"])
+    together = record.copy()
+    for key, (other, expected) in OTHERS.items():
+        changed = record[key] | other if isinstance(other, dict) else other
+        together[key] = changed
+        (tmp_path / "run.json").write_text(json.dumps(record | {key: changed}), encoding="utf-8")
+        refused(expected)
+    (tmp_path / "run.json").write_text(json.dumps(together), encoding="utf-8")
+    refused(*(expected for _, expected in OTHERS.values()))
+    assert not caplog.text  # neither trained nor called finished
+    (tmp_path / "run.json").write_bytes(whole["run.json"])
+    assert call(monkeypatch, *words) == (0, "") and "finished" in caplog.text
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == whole
+
+
+@pytest.mark.slow
+def test_a_run_is_finished_for_another_process_too(tmp_path):
+    """Which has loaded fewer libraries when it looks than training had when it ended."""
+    words = ["train", *sum((GOOD | {"--out": str(tmp_path)}).items(), ())]
+    for expected in ("finished: ", "holds this run already, finished"):
+        command = [sys.executable, "-m", "mace_rl.cli", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0 and expected in done.stderr, done.stderr
+
+
 @pytest.fixture
 def reference(monkeypatch, tmp_path):
     """A folder with one kept run."""
@@ -311,19 +400,50 @@ def test_without_chance_an_agent_takes_its_most_probable_actions(
     assert evaluate(tmp_path, 3, 5).tolist() != pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--out", "a.mp4"], "--out is 'a.mp4', but should end in .gif"),
-        (["--seconds", "0"], "--seconds should be greater than 0"),
-        (["--width", "10"], "--width from 50"),
-        (["--episodes", "0"], "--episodes should be at least 1"),
-        ([], "run.json: not readable"),
-    ],
-)
-def test_a_film_that_cannot_be_made_gets_one_line(monkeypatch, tmp_path, options, expected):
-    code, message = call(monkeypatch, "watch", str(tmp_path), *options)
-    assert code == 1 and expected in message and "\n" not in message
+UNFIT = {  # an option's value, and what would be right
+    ("watch", "--out", "a.mp4"): "'a.mp4', but should end in .gif",
+    ("watch", "--seconds", "0"): "0.0, but should be greater than 0",
+    ("watch", "--seconds", "nan"): "nan, but should be greater than 0",
+    ("watch", "--width", "10"): "10, but should be from 50 to 2000",
+    ("watch", "--width", "2001"): "2001, but should be from 50 to 2000",
+    ("watch", "--episodes", "0"): "0, but should be at least 1",
+    ("watch", "--seed", "-2"): "-2, but should be at least 0",
+    ("evaluate", "--episodes", "-3"): "-3, but should be at least 1",
+    ("evaluate", "--seed", "-1"): "-1, but should be at least 0",
+    ("verify", "--sample", "0"): "0, but should be at least 1",
+    ("verify", "--sample-seed", "-1"): "-1, but should be at least 0",
+}
+
+
+@pytest.mark.parametrize("command", UNFIT, ids=" ".join)
+def test_a_mistaken_value_of_an_option_is_named_alone(monkeypatch, tmp_path, command):
+    name, option, value = command
+    expected = f"mace-rl: {option} is {UNFIT[command]}"
+    assert call(monkeypatch, name, str(tmp_path), option, value) == (1, expected)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "watch"])
+@pytest.mark.parametrize("folder", ["nope", "unfinished", "a file"])
+def test_without_a_finished_run_nothing_is_played(monkeypatch, tmp_path, command, folder):
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished/checkpoint.pt").touch()
+    (tmp_path / "a file").touch()
+    path = tmp_path / folder
+    expected = f"mace-rl: no finished run in {path}: it has no run.json"
+    assert call(monkeypatch, command, str(path)) == (1, expected)
+
+
+@pytest.mark.parametrize("command", subcommands())
+def test_only_training_resumes_after_an_interruption(monkeypatch, caplog, command):
+    def interrupted(_) -> None:
+        raise KeyboardInterrupt
+
+    caplog.set_level("INFO")
+    monkeypatch.setattr(cli, command, interrupted)
+    needed = ["--out", "x", *sum(GOOD.items(), ())] if command == "train" else ["a folder"]
+    assert call(monkeypatch, command, *needed) == (130, "")
+    resumes = "; the same command resumes it" if command == "train" else ""
+    assert caplog.messages == ["interrupted" + resumes]
 
 
 def test_a_kept_run_is_verified_to_the_bit(reference, monkeypatch, capsys):

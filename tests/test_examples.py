@@ -35,8 +35,15 @@ def test_prints_a_row_for_each_seed_and_what_came_out():
 
 def test_help_and_mistakes():
     assert "example: python examples/sb3_ppo.py" in run("--help").stdout
-    done = run("--seeds", "0")
-    assert done.returncode == 2 and "--seeds and --steps should be at least 1" in done.stderr
+    for option, value, least in (("--seeds", 0, 1), ("--steps", -5, 1), ("--first-seed", -1, 0)):
+        done = run(option, str(value))
+        assert done.returncode == 2 and not done.stdout
+        assert done.stderr.endswith(f"{option} is {value}, but should be at least {least}\n")
+    for name in ("Foo", "CartPole-v9", "nope:Foo-v0"):
+        done = run("--environment", name)
+        assert done.returncode == 1 and not done.stdout
+        (line,) = done.stderr.splitlines()
+        assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")
 
 
 def test_curiosity_changes_the_policy_and_not_what_is_counted():

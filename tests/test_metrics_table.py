@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mace_rl.config.results import MetricsConfig
+from mace_rl.config.results import GOALS, MetricsConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.results import metrics as m
 from mace_rl.results.records import RecordError
@@ -228,6 +228,10 @@ def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
     assert names(["CartPole-v1"], reference_return={}) == ["solved"]
     columns = table(settings=CONFIG.within([*ENVIRONMENTS, "Other-v0"], VARIANTS)).columns
     assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
+    lines = CONFIG.incomplete([*ENVIRONMENTS, "Other-v0"])
+    assert [line.split()[0] for line in lines] == ["metrics." + key for key in GOALS]
+    assert all(line.endswith(" Other-v0") for line in lines)
+    assert CONFIG.incomplete(ENVIRONMENTS) == CONFIG.incomplete(["Other-v0"]) == []
 
 
 @pytest.mark.parametrize(

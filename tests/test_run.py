@@ -27,6 +27,7 @@ from shared import LAYER_NORM, VARIANTS, Bonanza, finish
 from mace_rl import sources
 from mace_rl.config.reading import merge, merge_layers
 from mace_rl.config.run import RunConfig
+from mace_rl.environments import hopper
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.agent import load_agent
@@ -516,6 +517,35 @@ def test_run_json_says_where_the_results_come_from(finished):
         name: hashlib.sha256((finished.directory / name).read_bytes()).hexdigest()
         for name in OUTCOME
     }
+
+
+@pytest.mark.parametrize(
+    ("environment", "changes", "reason"),
+    [
+        ("HopperBulletEnv-v0", {}, "numpy .* adds numbers in another order"),
+        ("SparseHopper-v0", {}, "numpy .* adds numbers in another order"),
+        ("CartPole-v1", {"environment_arguments": {"sutton_barto_reward": True}}, "steps are not"),
+        ("Acrobot-v1", {"engine": "torch"}, "network is not a compiled one"),
+    ],
+)
+def test_a_fast_path_that_is_not_taken_is_said_once(
+    run_config, tmp_path, monkeypatch, caplog, environment, changes, reason
+):
+    monkeypatch.setattr(hopper, "numpy_adds_as_assumed", lambda: False)
+    config = run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20, **changes)
+    run.run(config, tmp_path)
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    said = f"the fast path for {environment} is not taken: .*{reason}"
+    assert re.match(said, record.getMessage())
+
+
+@pytest.mark.parametrize("environment", [*ENVIRONMENTS, "SparseHopper-v0", "MountainCar-v0"])
+def test_of_a_fast_path_that_is_taken_or_not_there_nothing_is_said(
+    run_config, tmp_path, caplog, environment
+):
+    run.run(run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20), tmp_path)
+    assert not caplog.records
 
 
 def test_progress_says_how_far_it_is(interrupted):

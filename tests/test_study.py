@@ -241,6 +241,14 @@ def test_files_are_read_over_one_another(tmp_path: Path) -> None:
         read_study([CONFIG, overlay])
 
 
+@pytest.mark.parametrize("key", ["random_return", "reference_return", "solved_return"])
+def test_a_goal_of_an_environment_that_does_not_exist_is_refused(key: str, tmp_path: Path) -> None:
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text(f"metrics: {{{key}: {{CartPole-1: 475.0}}}}\n")
+    with pytest.raises(ConfigError, match=rf"metrics\.{key} has 'CartPole-1'.* 'CartPole-v1'$"):
+        read_study([CONFIG, overlay])
+
+
 FILES = sorted(path.name for path in (CONFIG.parent / "config").glob("*.yaml"))
 COMBINED = [[name, "exploration.yaml"] for name in ("controls.yaml", "ablations.yaml")]
 COMBINED += [["exploration.yaml", "controls.yaml", "ablations.yaml", "barren.yaml"]]

@@ -40,6 +40,8 @@ def test_defaults_are_the_study_s():
         ({"beta": "big"}, "beta.value is 'big', but .* number"),
         ({"memory": {"capcity": 5}}, "unknown key 'memory.capcity' .* 'capacity'"),
         ({"memory": 5}, "memory is 5, but"),
+        ({"relevance": False, "memory": {"capacity": 70}}, "relevance False does not use memory"),
+        ({"relevance": False, "memory": {}}, "relevance False does not use memory"),
         ({"novelty": {"kind": "counts"}}, "novelty.kind is 'counts', but the observations are Box"),
         ({"novelty": {"neighbours": [9000]}}, "neighbours has 9000, which must be less than"),
         ({"discount": 1.1}, "discount is 1.1, but .* less than or equal to 1"),

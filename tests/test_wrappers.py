@@ -502,6 +502,9 @@ def test_a_state_made_with_other_settings_is_refused():
     two = VectorCuriosityReward(vector_of("CartPole-v1", 2, AutoresetMode.NEXT_STEP))
     with pytest.raises(ConfigError, match="made with environments 1, but here it is 2"):
         two.load_state_dict(state)
+    state["settings"]["curves"] = 3  # as a later version could have it
+    with pytest.raises(ConfigError, match="made with curves 3, which is no setting here"):
+        CuriosityReward(gymnasium.make("CartPole-v1")).load_state_dict(state)
 
 
 def test_equal_seeds_give_equal_rewards_and_others_do_not():

@@ -1,12 +1,12 @@
 """Keep finished runs small, or put kept ones back: exact, one file per environment and variant.
 
-    .venv/bin/python -m tools.archive pack RESULTS ARCHIVE      results/paper reference/study/paper
-    .venv/bin/python -m tools.archive unpack ARCHIVE RESULTS
+    .venv/bin/python -m tools.archive pack RESULTS ARCHIVE      results/study reference/study
+    .venv/bin/python -m tools.archive unpack ARCHIVE RESULTS    reference/study results/study
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
 what is not kept; of seed0 the agent too, which the report shows at play.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to those that are there;
-equal runs give equal files.
+equal runs give equal files. `make tables` reads what is in reference/study.
 """
 
 import argparse
@@ -47,8 +47,11 @@ def write(archive: Path, content: dict[str, bytes]) -> None:
 def pack(results: Path, archives: Path) -> int:
     """Add the finished runs of `results` to `archives`; returns how many there are now.
 
-    Raises `ValueError` if a run's records are not those that its `run.json` describes.
+    Raises `ValueError` if there are none in `results`, or if a run's records are not those that its
+    `run.json` describes.
     """
+    if not any(results.glob(f"runs/*/*/seed*/{files.RECORD}")):
+        raise ValueError(f"{results}: no runs/ENV/VARIANT/seedN/{files.RECORD} in it")
     count = 0
     for variant in sorted(results.glob("runs/*/*")):
         archive = archives / variant.parent.name / f"{variant.name}.tar.xz"
@@ -71,7 +74,10 @@ def pack(results: Path, archives: Path) -> int:
 
 
 def unpack(archives: Path, results: Path) -> int:
-    """Put the runs in `archives` where they were below `results`; returns how many."""
+    """Put the runs in `archives` where they were below `results`; returns how many.
+
+    Raises `ValueError` if there are none.
+    """
 
     def put_back(archive: Path) -> int:
         variant = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
@@ -81,8 +87,11 @@ def unpack(archives: Path, results: Path) -> int:
             (variant / name).write_bytes(data)  # half of it would not be what run.json describes
         return sum(name.endswith(files.RECORD) for name in content)
 
+    packed = sorted(archives.glob("*/*.tar.xz"))
+    if not packed:
+        raise ValueError(f"{archives}: no ENV/VARIANT.tar.xz in it")
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return sum(pool.map(put_back, sorted(archives.glob("*/*.tar.xz"))))
+        return sum(pool.map(put_back, packed))
 
 
 def main() -> None:

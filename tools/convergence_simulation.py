@@ -11,6 +11,7 @@ adds the median ± the standard deviation over seeds of each environment and var
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.results import MetricsConfig
+from mace_rl.config.section import ConfigError
 from mace_rl.results import metrics as m
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -147,9 +149,15 @@ def column(shape: str) -> list[str]:
 
 
 def real_columns(folder: Path) -> dict[str, list[str]]:
-    """The cells of the finished runs ENVIRONMENT/VARIANT/seedN in a folder."""
+    """The cells of the finished runs ENVIRONMENT/VARIANT/seedN in a folder.
+
+    Raises `ConfigError` if there are none, or if one's mean return of random actions is unknown.
+    """
+    groups = {path.parents[1] for path in folder.glob("*/*/seed*/episodes.csv")}
+    if not groups:
+        raise ConfigError(f"{folder}: no ENVIRONMENT/VARIANT/seedN/episodes.csv in it")
     columns = {}
-    for group in sorted(path for path in folder.glob("*/*") if path.is_dir()):
+    for group in sorted(groups):
         random = SETTINGS.random_return_in(group.parent.name)
         curves = [
             curve_of(np.genfromtxt(path, delimiter=",", names=True)["extrinsic_return"], random)
@@ -171,9 +179,13 @@ def main() -> None:
     )
     parser.add_argument("folders", type=Path, nargs="*", help="of runs")
     folders: list[Path] = parser.parse_args().folders
-    columns = {shape: column(shape) for shape in SHAPES}
-    for folder in folders:
-        columns |= real_columns(folder)
+    real: dict[str, list[str]] = {}
+    try:
+        for folder in folders:
+            real |= real_columns(folder)
+    except ConfigError as error:
+        sys.exit(f"convergence_simulation: {error}")
+    columns = {shape: column(shape) for shape in SHAPES} | real
     print("|", " | ".join(["", *columns]), "|")
     print("|---" * (1 + len(columns)) + "|")
     for name, *cells in zip(READINGS, *columns.values(), strict=True):

@@ -4,6 +4,7 @@
 """
 
 import argparse
+import sys
 
 import gymnasium
 import numpy as np
@@ -28,7 +29,8 @@ def random_returns(name: str, episodes: int) -> np.ndarray:
     return returns
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
         epilog="example: python -m tools.random_return CartPole-v1 2000",
@@ -36,6 +38,17 @@ if __name__ == "__main__":
     parser.add_argument("environment", help="its Gymnasium id")
     parser.add_argument("episodes", type=int)
     arguments = parser.parse_args()
-    measured = random_returns(arguments.environment, arguments.episodes)
-    error = measured.std(ddof=1) / np.sqrt(len(measured))
-    print(f"{arguments.environment}: {measured.mean():.4g} (standard error {error:.2g})")
+    name, episodes = arguments.environment, arguments.episodes
+    if episodes < 2:
+        sys.exit(f"random_return: EPISODES is {episodes}, but should be at least 2")
+    try:
+        measured = random_returns(name, episodes)
+    except (gymnasium.error.Error, ImportError) as error:
+        reason = " ".join(str(error).split())
+        sys.exit(f"random_return: ENVIRONMENT is {name!r}, which cannot be made: {reason}")
+    standard_error = measured.std(ddof=1) / np.sqrt(episodes)
+    print(f"{name}: {measured.mean():.4g} (standard error {standard_error:.2g})")
+
+
+if __name__ == "__main__":
+    main()

@@ -160,6 +160,11 @@ class Appraisal:
         """See `CuriosityReward`."""
         state, mine = copy.deepcopy(state), self.described()
         for name, value in state["settings"].items():
+            if name not in mine:
+                raise ConfigError(
+                    f"the state to load was made with {name} {short(value)}, which is no setting "
+                    "here"
+                )
             if value != mine[name]:
                 raise ConfigError(
                     f"the state to load was made with {name} {short(value)}, but here it is "

@@ -10,7 +10,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import read_study
 from mace_rl.refusal import Refusal
-from mace_rl.runs.provenance import read_record, sources_of
+from mace_rl.runs.provenance import file_digest, read_record
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,13 @@ def parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", required=True, type=int)
     train.add_argument("--episodes", type=int, help="instead of the config's budget")
     train.add_argument(
-        "--config", type=Path, help="a YAML file read over the project's config.yaml"
+        "--config",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="YAML files read over the project's config.yaml, one after the other",
     )
     train.add_argument(
         "--engine",
@@ -102,23 +108,38 @@ def parser() -> argparse.ArgumentParser:
 
 def run_config(arguments: argparse.Namespace) -> RunConfig:
     """The run that the command line asks for; raises `ConfigError`."""
-    study = read_study([CONFIG, arguments.config] if arguments.config else [CONFIG])
-    config = study.run_config(arguments.env, arguments.variant, arguments.seed)
+    study = read_study([CONFIG, *arguments.config])
+    try:
+        config = study.run_config(arguments.env, arguments.variant, arguments.seed)
+    except ConfigError as error:
+        if arguments.variant in study.variant_settings:
+            raise
+        raise ConfigError(f"{error}; variants of further studies need --config FILE") from None
     changes: dict[str, object] = {}
     if arguments.episodes is not None:
-        if arguments.episodes < 1:
-            raise ConfigError(f"--episodes is {arguments.episodes}, but should be at least 1")
+        _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
         changes["episodes"] = arguments.episodes
     if arguments.engine is not None:
         changes["engine"] = arguments.engine
     return config.model_copy(update=changes)
 
 
+def _require(fits: bool, option: str, value: object, right: str) -> None:
+    """Raise a `ConfigError` that says what an option is and what is right, unless it `fits`."""
+    if not fits:
+        raise ConfigError(f"{option} is {value!r}, but should {right}")
+
+
 def finished(config: RunConfig, directory: Path) -> bool:
-    """Whether `directory` holds the results of this run; `ConfigError` if they are of another."""
+    """Whether `directory` holds the results of this run, whole and as it would come out now.
+
+    Raises `ConfigError` if they are damaged, of another run, or of other code, versions or
+    arithmetic, as a checkpoint of those is not continued.
+    """
     record = directory / files.RECORD
     if not record.exists():
         return False
+    way_out = "choose another --out, or remove the folder"
     content = read_record(record)
     found = check(RunConfig, content["config"], str(record)).settings()
     wanted = config.settings()
@@ -127,14 +148,28 @@ def finished(config: RunConfig, directory: Path) -> bool:
         key = different[0]
         raise ConfigError(
             f"{directory} holds a finished run whose {key} is {found.get(key)!r}, "
-            f"not {wanted.get(key)!r}; choose another --out"
+            f"not {wanted.get(key)!r}; {way_out}"
         )
-    own = config.references()
-    if own and content["sources"] != sources_of(config):
-        raise ConfigError(
-            f"{directory} holds a finished run of other code, in {', '.join(own.values())} or"
-            " mace_rl; choose another --out"
-        )
+    for path in (directory / name for name in files.RESULTS):
+        if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
+            raise ConfigError(
+                f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {way_out}"
+            )
+    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
+    from mace_rl.runs.checkpoint import difference
+    from mace_rl.runs.run import run_identity
+
+    now = run_identity(config)
+    other = [
+        f"other {key} ({difference(content[key], now[key])})"
+        for key in ("versions", "arithmetic")
+        if content[key] != now[key]
+    ]
+    if content["sources"] != now["sources"]:
+        code = " or ".join([*config.references().values(), "mace_rl"])
+        other.insert(0, f"other code, in {code}")
+    if other:
+        raise ConfigError(f"{directory} holds a finished run of {', '.join(other)}; {way_out}")
     return True
 
 
@@ -145,8 +180,7 @@ def train(arguments: argparse.Namespace) -> None:
         (arguments.out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
         logger.info("%s holds this run already, finished", arguments.out)
         return
-    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
-    from mace_rl.runs import progress, run
+    from mace_rl.runs import progress, run  # not above: see `finished`
 
     with progress.line(sys.stderr) as observe:
         run.run(config, arguments.out, observe)
@@ -168,15 +202,17 @@ def _play(parser: argparse.ArgumentParser, episodes: int) -> None:
 
 
 def _require_playable(arguments: argparse.Namespace) -> None:
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise ConfigError("--episodes should be at least 1 and --seed at least 0")
+    _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
+    _require(arguments.seed >= 0, "--seed", arguments.seed, "be at least 0")
+    if not (arguments.folder / files.RECORD).exists():
+        raise ConfigError(f"no finished run in {arguments.folder}: it has no {files.RECORD}")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """`mace-rl evaluate`."""
+    _require_playable(arguments)
     from mace_rl.runs import evaluate
 
-    _require_playable(arguments)
     returns = evaluate.evaluate(
         arguments.folder, arguments.episodes, arguments.seed, arguments.deterministic
     )
@@ -188,13 +224,12 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def watch(arguments: argparse.Namespace) -> None:
     """`mace-rl watch`."""
-    _require_playable(arguments)
-    if not (arguments.seconds > 0 and 50 <= arguments.width <= 2000):
-        raise ConfigError("--seconds should be greater than 0 and --width from 50 to 2000")
+    _require(arguments.seconds > 0, "--seconds", arguments.seconds, "be greater than 0")
+    _require(50 <= arguments.width <= 2000, "--width", arguments.width, "be from 50 to 2000")
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
     out: Path = arguments.out or arguments.folder / name
-    if out.suffix != ".gif":
-        raise ConfigError(f"--out is {str(out)!r}, but should end in .gif")
+    _require(out.suffix == ".gif", "--out", str(out), "end in .gif")
+    _require_playable(arguments)
     from mace_rl.runs import watch
 
     film = watch.film(
@@ -223,14 +258,13 @@ def tensorboard(arguments: argparse.Namespace) -> None:
 
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
+    sample, seed = arguments.sample, arguments.sample_seed
+    _require(sample is None or sample >= 1, "--sample", sample, "be at least 1")
+    _require(seed >= 0, "--sample-seed", seed, "be at least 0")
     from mace_rl.runs import verify
 
-    if arguments.sample is not None and arguments.sample < 1:
-        raise ConfigError(f"--sample is {arguments.sample}, but should be at least 1")
     confidence = read_study([CONFIG]).metrics.confidence
-    for line in verify.verify(
-        arguments.folder, arguments.sample, arguments.sample_seed, confidence
-    ):
+    for line in verify.verify(arguments.folder, sample, seed, confidence):
         print(line, flush=True)
 
 
@@ -250,7 +284,8 @@ def main() -> None:
     except (Refusal, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
-        logger.info("interrupted; the same command resumes it")
+        resumes = arguments.command == "train"
+        logger.info("interrupted%s", "; the same command resumes it" if resumes else "")
         sys.exit(130)
 
 

@@ -40,7 +40,7 @@ class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …}, "random", "bandit", "custom". Not "meta", which learns from policy
         gradients.
-    relevance: False for novelty alone, without the memory.
+    relevance: False for novelty alone, without the memory, whose settings are refused then.
     memory, novelty: what differs from the study's settings (`mace_rl.config.wrappers`), by name.
     discount: γ of the agent (gamma in stable-baselines3), per step.
     rollout_steps: steps between the agent's updates (n_steps there); only a bandit asks for it.

@@ -15,6 +15,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 from mace_rl.config.plugins import source_file
 from mace_rl.results import paper
+from mace_rl.results.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
 
@@ -32,6 +33,11 @@ try:
     study = load_study(merge(config, given), origin)
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {error}")
+try:
+    MEASURED = study.metrics.within(study.environments, study.variants)
+    all_metrics(MEASURED)  # the user's own among them: are they metrics?
+except ConfigError as error:
+    sys.exit(f"Error in the configuration: {origin}: {error}")
 
 RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
@@ -39,11 +45,9 @@ RUNS = study.runs()
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
 RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
 # The claim ledger is for a study that has all the paper makes claims of.
-TESTS_CLAIMS = (
-    set(paper.ENVIRONMENTS) <= set(study.environments)
-    and set(paper.VARIANTS) <= set(study.variants)
-    and set(paper.ENVIRONMENTS) <= set(study.metrics.reference_return)
-)
+TESTS_CLAIMS = set(paper.ENVIRONMENTS) <= set(MEASURED.reference_return) and set(
+    paper.VARIANTS
+) <= set(study.variants)
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
 # The regret of a learnt β only where the configuration asks for it.
 PICTURES = ["every_seed", "profiles"]

@@ -52,6 +52,8 @@ onstart:
     due = [tuple(job.wildcards_dict.values()) for job in jobs]
     cores = workflow.cores if workflow.local_exec else None
     watched = Study(watched_runs(), due, cores, workflow.execution_settings.retries)
+    for line in study.metrics.incomplete(study.environments):
+        logger.info(line)
     logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra={"study": watched})
 
 

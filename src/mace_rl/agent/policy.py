@@ -114,7 +114,10 @@ class Policy:
         return np.concatenate([gradient, grad_log_std]), entropy
 
     def for_acting(self, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:
-        """The policy with observation normalisation in front of it; follows later updates."""
+        """The policy with observation normalisation in front of it.
+
+        Its weights follow later updates; `mean` and `std` stay as they are now.
+        """
         normalisation = mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip)
         if isinstance(self.network, CompiledMLP):
             log_std = None if self.discrete else self.log_std

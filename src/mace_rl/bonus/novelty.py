@@ -150,7 +150,7 @@ class DensityNovelty(Novelty):
         return max(1, int(self.normaliser.varied.sum()))
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """See `Novelty`. Before anything was visited everything has novelty 1."""
+        """See `Novelty`. 1 everywhere until the buffer has more states than the largest k."""
         if self.seen <= max(self.config.neighbours):
             return np.ones(len(states))
         weight = self.config.knn_weight

@@ -60,11 +60,22 @@ class MetricsConfig(Section):
         """The values of `GOALS`, by environment; empty for a study without them."""
         return tuple(getattr(self, key) for key in GOALS)
 
+    def incomplete(self, environments: Sequence[str]) -> list[str]:
+        """A line for each of `GOALS` that `within` leaves out for want of some environments."""
+        lines = []
+        for key in GOALS:
+            goal = getattr(self, key)
+            missing = [name for name in environments if name not in goal]
+            if missing and len(missing) < len(environments):
+                lines.append(f"metrics.{key} is left out: it has nothing for {', '.join(missing)}")
+        return lines
+
     def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
         """These settings for a study of these environments and variants.
 
-        Of `GOALS`, what not every environment has is left out. Raises `ConfigError` for a goal that
-        random actions attain, and for a regret of variants that the study does not have.
+        Of `GOALS`, what not every environment has is left out (see `incomplete`). Raises
+        `ConfigError` for a goal that random actions attain, and for a regret of variants that the
+        study does not have.
         """
         goals: dict[str, dict[str, float]] = {}
         for key in GOALS:

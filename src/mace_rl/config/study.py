@@ -21,7 +21,7 @@ from pydantic import AfterValidator, Field, ValidationError
 import mace_rl.environments  # noqa: F401  (registers our own)
 from mace_rl.config.plugins import import_module, load, source_file
 from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
-from mace_rl.config.results import FigureConfig, MetricsConfig
+from mace_rl.config.results import GOALS, FigureConfig, MetricsConfig
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, explain, short
 
@@ -173,6 +173,12 @@ def load_study(config: Any, origin: str) -> Study:
             _check_known(environment, known, "environment_seeds", "environments")
         for environment in study.environments:
             study.metrics.random_return_in(environment)  # there has to be one
+        for key in ("random_return", *GOALS):
+            for environment in getattr(study.metrics, key):
+                if environment not in known and ":" not in environment:
+                    _check_known(
+                        environment, gymnasium.registry, f"metrics.{key}", "Gymnasium's registry"
+                    )
         for reference in study.metrics.custom:
             load(reference, "metrics.custom")
     except ConfigError as error:
@@ -272,6 +278,6 @@ def _check_environment(config: RunConfig, key: str) -> None:
 def _check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
     known = list(known)
     if name not in known:
-        nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)
+        nearest = difflib.get_close_matches(name, known, n=1)
         hint = f"; the nearest there is {nearest[0]!r}" if nearest else ""
         raise ConfigError(f"{key} has {name!r}, which is not in {where}{hint}")

@@ -45,6 +45,8 @@ class CuriosityConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _over_the_study_s(cls, values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("relevance") is False and "memory" in values:
+            raise ValueError("relevance False does not use memory: one of the two should go")
         for section, defaults in (("memory", MEMORY), ("novelty", NOVELTY)):
             given = values.get(section, {})
             if isinstance(given, Mapping):

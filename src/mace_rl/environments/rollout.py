@@ -18,6 +18,8 @@ from mace_rl.environments import classic_control
 from mace_rl.environments.environment import Environment
 from mace_rl.finite import require_finite
 
+COMPILED = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}  # what the compiled loop plays
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -100,16 +102,27 @@ def roll_out_compiled(
 def rollout_for(
     environment: Environment, policy: ActingPolicy
 ) -> Callable[[Environment, Any, np.ndarray], Episode]:
-    """The fastest rollout that is exact for this environment and this kind of policy.
+    """The fastest rollout that is exact for this environment and this kind of policy."""
+    compiled = environment.name in COMPILED and not fallback_reason(environment, policy)
+    return roll_out_compiled if compiled else roll_out
 
-    The compiled one has to take the same steps as the environment, which is tried here: other
+
+def fallback_reason(environment: Environment, policy: ActingPolicy) -> str:
+    """Why the fast path made for this environment is not taken, "" if it is or there is none.
+
+    Compiled episodes have to take the same steps as the environment, which is tried here: other
     parameters, another version or a C library with another sine all end in the ordinary rollout.
     """
-    compiled_class = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}.get(environment.name)
-    exact = type(environment.env.unwrapped) is compiled_class
-    if not (exact and isinstance(policy, CompiledActing)):
-        return roll_out
-    return roll_out_compiled if takes_compiled_steps(environment.env.unwrapped) else roll_out
+    inner: Any = environment.env.unwrapped
+    if environment.name not in COMPILED:
+        return getattr(inner, "fallback_reason", "")  # `FastHopperBulletEnv` has one
+    if type(inner) is not COMPILED[environment.name]:
+        return f"the environment is of type {type(inner).__name__}, not Gymnasium's own"
+    if not isinstance(policy, CompiledActing):
+        return "the policy's network is not a compiled one"
+    if not takes_compiled_steps(inner):
+        return "the environment's steps are not equal to the compiled ones"
+    return ""
 
 
 def takes_compiled_steps(inner: Any) -> bool:

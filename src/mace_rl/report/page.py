@@ -189,7 +189,7 @@ def _claims(ledger: Mapping[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def _part(part: Mapping[str, Any]) -> dict[str, Any]:
-    names = ("difference", "low", "high", "detectable")
+    names = ("difference", "low", "high", "in_paper", "worth_mentioning", "detectable")
     shown: dict[str, Any] = {name: number(part[name], digits_of(part)) for name in names}
     return dict(part) | shown | {"environments": ", ".join(part["environments"])}
 

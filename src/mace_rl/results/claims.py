@@ -38,7 +38,7 @@ CORRELATION = "stagnation_correlation"  # of stagnation and the β that follows;
 LEVEL = 0.05  # of the corrected p values
 WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
-POWER = 0.8  # of the smallest difference that could have been shown
+POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
 LITERAL, ROBUST = "as the paper's code measures", "robust"
 
@@ -146,8 +146,9 @@ class Finding:
     probability: float  # that a run of the variant is better than one of the baseline
     probability_low: float
     probability_high: float
-    detectable: float  # the smallest difference that these seeds show with a power of `POWER`
+    detectable: float  # what these seeds show with a power of `POWER`, before correction
     worth_mentioning: float
+    in_paper: float  # the same difference in the paper's Table 1; NaN where that has none
     p_holm: float = np.nan
     outcome: str = ""  # holds, fails or open
 
@@ -168,10 +169,13 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]
     """A record per claim: statement, what the paper's table says, verdicts and `Finding`s.
 
     table: the frame of metrics.csv with a column `CORRELATION`, and with the paper's environments
-    and variants; seeds may differ between environments, not between variants.
+    and variants; seeds may differ between environments, not between variants. Of one seed there are
+    no intervals and no tests: NaN.
     """
     found = {
-        how: [[_find(part, table, settings) for part in claim.parts[how]] for claim in CLAIMS]
+        how: [
+            [_find(part, claim, table, settings) for part in claim.parts[how]] for claim in CLAIMS
+        ]
         for how in (LITERAL, ROBUST)
     }
     records = []
@@ -183,10 +187,16 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]
         for how, of_claims in found.items():
             record[how] = {
                 "verdict": verdict([finding.outcome for finding in of_claims[number]]),
-                "parts": [asdict(finding) for finding in of_claims[number]],
+                "parts": [_record(finding) for finding in of_claims[number]],
             }
         records.append(record)
     return records
+
+
+def _record(finding: Finding) -> dict[str, Any]:
+    """A finding for JSON, which has no NaN."""
+    values = asdict(finding)
+    return {key: None if value != value else value for key, value in values.items()}
 
 
 def verdict(outcomes: Sequence[str]) -> str:
@@ -207,14 +217,16 @@ def outcome(finding: Finding) -> str:
 
 def _judge(findings: list[Finding]) -> None:
     """Correct the p values of all parts together, and say what each came out as."""
-    corrected = holm([finding.p_value for finding in findings])
-    for finding, p_holm in zip(findings, corrected, strict=True):
+    tested = [finding for finding in findings if not np.isnan(finding.p_value)]
+    corrected = holm([finding.p_value for finding in tested])
+    for finding, p_holm in zip(tested, corrected, strict=True):
         finding.p_holm = float(p_holm)
+    for finding in findings:
         finding.outcome = outcome(finding)
 
 
-def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
-    """Estimates and test of one part."""
+def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
+    """Estimates and test of one part of a claim."""
     metrics = {metric.name: metric for metric in all_metrics(settings)}
     pairs = [_pair(part, table[table["env"] == env], metrics) for env in part.environments]
     everything = [_everything(part, table, env, metrics, settings) for env in part.environments]
@@ -236,6 +248,7 @@ def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
         *chance,
         _detectable(differences, settings.confidence),
         WORTH_MENTIONING * everything[0],
+        _in_paper(part, claim) if unit == "episodes" else np.nan,
     )
 
 
@@ -281,6 +294,17 @@ def _detectable(differences: Sequence[np.ndarray], confidence: float) -> float:
     return float(quantiles.sum() * error)
 
 
+def _in_paper(part: Part, claim: Claim) -> float:
+    """By how many episodes the variant is earlier than the baseline in the paper's Table 1."""
+    if claim.paper is None or part.baseline is None:
+        return np.nan
+    environment, column = claim.paper
+    variant, baseline = (
+        PAPER_TABLE1[environment, name][column] for name in (part.variant, part.baseline)
+    )
+    return float(baseline - variant)
+
+
 def _paper(claim: Claim) -> str:
     """What the paper's own table says of a claim; empty where it says nothing."""
     if claim.paper is None:
@@ -295,7 +319,8 @@ def _paper(claim: Claim) -> str:
 
 def as_json(records: Sequence[Mapping[str, Any]], cost: Mapping[str, Any]) -> str:
     """The data of claims.json: what it cost, then the records of `ledger`."""
-    return json.dumps({"cost": cost, "claims": records}, indent=2, ensure_ascii=False) + "\n"
+    whole = {"cost": cost, "claims": records}
+    return json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:
@@ -318,16 +343,25 @@ def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:
             "",
             f"## Part by part: {how}",
             "",
-            "Differences count in the claim's favour. *Detectable*: the smallest that these seeds"
-            f" show with a power of {POWER:.0%}. *P*: that a run of the first is better.",
+            "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
+            " *P*: that a run of the first is better. *Margin*: what counts as an advantage worth"
+            f" mentioning. *Detectable*: the smallest that these seeds show with a power of"
+            f" {POWER:.0%}, before correction.",
             "",
-            "| | environment | metric | over | n | difference | p (Holm) | P | detectable | |",
-            "|---|---|---|---|---|---|---|---|---|---|",
+            *parts_table(records, how),
         ]
-        for record in records:
-            for part in record[how]["parts"]:
-                lines.append(f"| {record['claim']} | {_row(part)} |")
     return "\n".join(lines) + "\n"
+
+
+def parts_table(records: Sequence[Mapping[str, Any]], how: str) -> list[str]:
+    """Every part of every claim, measured in one of the two ways, as lines of Markdown."""
+    columns = ["", "environment", "metric", "over", "n", "difference", "p (Holm)", "P", "paper"]
+    columns += ["margin", "detectable", ""]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for record in records:
+        for part in record[how]["parts"]:
+            lines.append(f"| {' | '.join([record['claim'], *_cells(part)])} |")
+    return lines
 
 
 def digits_of(part: Mapping[str, Any]) -> int:
@@ -335,23 +369,30 @@ def digits_of(part: Mapping[str, Any]) -> int:
     return {"episodes": 0, "return": 1}.get(part["unit"], 3)
 
 
-def _row(part: Mapping[str, Any]) -> str:
-    """One part, as cells."""
+def _cells(part: Mapping[str, Any]) -> list[str]:
+    """What the table has of one part."""
     digits = digits_of(part)
-    difference, low, high, detectable = (
-        f"{part[name]:.{digits}f}" for name in ("difference", "low", "high", "detectable")
-    )
-    chance = [f"{part[f'probability{end}']:.2f}" for end in ("", "_low", "_high")]
-    return " | ".join(
-        [
-            ", ".join(part["environments"]),
-            part["metric"],
-            f"{part['variant']} over {part['baseline'] or '0'}",
-            str(part["seeds"]),
-            f"{difference} ({low} to {high})",
-            f"{part['p_holm']:.3f}",
-            f"{chance[0]} ({chance[1]} to {chance[2]})",
-            detectable,
-            part["outcome"],
-        ]
-    )
+    names = ("difference", "low", "high", "in_paper", "worth_mentioning", "detectable")
+    difference, low, high, paper, margin, detectable = (_shown(part[x], digits) for x in names)
+    chance = [_shown(part[f"probability{end}"], 2) for end in ("", "_low", "_high")]
+    return [
+        "all" if len(part["environments"]) > 1 else part["environments"][0],
+        part["metric"],
+        f"{part['variant']} over {part['baseline'] or '0'}",
+        str(part["seeds"]),
+        f"{difference} ({low} to {high})",
+        _shown(part["p_holm"], 3),
+        f"{chance[0]} ({chance[1]} to {chance[2]})",
+        paper,
+        margin,
+        detectable,
+        part["outcome"],
+    ]
+
+
+def _shown(value: float | None, digits: int) -> str:
+    """A number with a true minus, and without one before a zero; a dash where there is none."""
+    if value is None:
+        return "–"
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−" if float(text) else "")

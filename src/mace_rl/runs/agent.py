@@ -14,7 +14,7 @@ from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from mace_rl import files
 from mace_rl.agent import kernels
-from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
+from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing, Policy
 from mace_rl.agent.ppo import PPO
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
@@ -103,12 +103,20 @@ def load_acting(directory: Path, deterministic: bool = False) -> tuple[Environme
         policy.log_std[:] = state["policy.log_std"].numpy()
     mean, std = state["policy.mean"].numpy(), state["policy.std"].numpy()
     clip = float(state["policy.clip"])
-    if deterministic:
-        unit = (1.0 / std).astype(np.float32)
-        return trainer.environment, MostProbable(
-            policy, mean.astype(np.float32), unit, np.float32(clip)
-        )
-    return trainer.environment, policy.for_acting(mean, std, clip)
+    return trainer.environment, acting(policy, mean, std, clip, deterministic)
+
+
+def acting(
+    policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float, deterministic: bool
+) -> ActingPolicy:
+    """The policy for rollouts, with observation normalisation in front of it.
+
+    It samples its actions, or if `deterministic` takes the most probable ones.
+    """
+    if not deterministic:
+        return policy.for_acting(mean, std, clip)
+    unit = (1.0 / std).astype(np.float32)
+    return MostProbable(policy, mean.astype(np.float32), unit, np.float32(clip))
 
 
 def read_agent(directory: Path) -> tuple[RunConfig, dict[str, Tensor]]:

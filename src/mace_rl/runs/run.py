@@ -24,6 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from mace_rl import arithmetic, files
 from mace_rl.config.run import RunConfig
+from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
@@ -70,6 +71,9 @@ def run(
             half_written.unlink()
         started = time.monotonic()
         trainer = Trainer(config)
+        slow = fallback_reason(trainer.environment, trainer.ppo.acting_policy())
+        if slow:
+            logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # what is there stays: the collector need not look through it again
         identity = run_identity(config)
         before, saving, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)

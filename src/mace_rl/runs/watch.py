@@ -18,7 +18,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.environments.environment import Environment, nothing_printed
 from mace_rl.environments.rollout import draw_noise, roll_out
-from mace_rl.runs.agent import MostProbable, load_acting
+from mace_rl.runs.agent import acting, load_acting
 from mace_rl.runs.provenance import read_record
 from mace_rl.train import Trainer
 
@@ -112,10 +112,9 @@ def film(
     config = check(
         RunConfig, read_record(directory / files.RECORD)["config"], str(directory / files.RECORD)
     )
-    acting = (
+    environment, policy = (
         _untrained(config, deterministic) if untrained else load_acting(directory, deterministic)
     )
-    environment, policy = acting
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):
@@ -165,10 +164,5 @@ def gif(shown: Film) -> bytes:
 def _untrained(config: RunConfig, deterministic: bool) -> tuple[Environment, ActingPolicy]:
     """What `load_acting` gives, with the policy that the run began with."""
     trainer = Trainer(config)
-    if not deterministic:
-        return trainer.environment, trainer.ppo.acting_policy()
-    mean, std, clip = trainer.ppo.normalisation()
-    unit = (1.0 / std).astype(np.float32)
-    return trainer.environment, MostProbable(
-        trainer.ppo.policy, mean.astype(np.float32), unit, np.float32(clip)
-    )
+    ppo = trainer.ppo
+    return trainer.environment, acting(ppo.policy, *ppo.normalisation(), deterministic)

@@ -1,0 +1,85 @@
+"""docs/reduced, which `make quick` gives again to the byte, from kept runs without training.
+
+A run's first episodes do not depend on its budget, so those of the study's runs are the reduced
+ones.
+"""
+
+import io
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from shared import VARIANTS, finish
+
+from mace_rl import files
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import check
+from mace_rl.config.study import read_study
+from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.metrics import metrics_table
+from mace_rl.results.records import RunKey, read_episodes
+from mace_rl.results.tables import table1, table1_latex
+from tools import archive
+
+ROOT = Path(__file__).parents[1]
+EXPECTED, KEPT = ROOT / "docs" / "reduced", ROOT / "reference" / "study"
+STUDY = read_study([ROOT / "config.yaml", ROOT / "config" / "reduced.yaml"])
+METRICS = STUDY.metrics.within(STUDY.environments, STUDY.variants)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> dict[RunKey, pd.DataFrame]:
+    """The records of the reduced study's runs."""
+    cut, frames = tmp_path_factory.mktemp("reduced") / files.EPISODES, {}
+    kept = {
+        (environment, variant): archive.read(KEPT / environment / f"{variant}.tar.xz")
+        for environment in STUDY.environments
+        for variant in STUDY.variants
+    }
+    for environment, variant, seed in STUDY.runs():
+        content = kept[environment, variant]
+        config = STUDY.run_config(environment, variant, seed)
+        record = json.loads(content[f"seed{seed}/{files.RECORD}"])
+        settings = check(RunConfig, record["config"], "the kept run").settings()
+        assert settings | {"episodes": config.episodes} == config.settings()
+        lines = io.BytesIO(content[f"seed{seed}/{files.EPISODES}"]).readlines()
+        cut.write_bytes(b"".join(lines[: config.episodes + 1]))
+        frames[environment, variant, seed] = read_episodes(cut, config.episodes)
+    return frames
+
+
+def test_table_1(runs):
+    metrics = metrics_table(runs, STUDY.runs(), METRICS)
+    table = table1(metrics, METRICS)
+    assert table.to_csv(index=False).encode() == (EXPECTED / "table1.csv").read_bytes()
+    latex = table1_latex(table, STUDY.labels, METRICS)
+    assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()
+
+
+@pytest.mark.parametrize("number", ["1", "2"])
+def test_figures(runs, tmp_path, number):
+    shown = quantity(number, STUDY.metrics)
+    single_seeds = seed_curves(runs, shown)
+    figure = draw_figure(
+        mean_curves(single_seeds, shown, STUDY.metrics),
+        single_seeds,
+        shown,
+        STUDY.figure,
+        STUDY.metrics.confidence,
+        STUDY.labels,
+        STUDY.colours,
+    )
+    name = f"figure{number}.png"
+    save_figure(figure, tmp_path / name)
+    assert (tmp_path / name).read_bytes() == (EXPECTED / name).read_bytes()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("environment", STUDY.environments)
+def test_the_first_episodes_do_not_depend_on_the_budget(run_config, environment, variant):
+    short, long = (
+        finish(run_config(environment, variant, 3, episodes=episodes)) for episodes in (6, 10)
+    )
+    assert short.records == long.records[:6]
+    assert list(map(str, short.diagnostics)) == list(map(str, long.diagnostics[:6]))  # with NaN

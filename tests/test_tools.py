@@ -1,0 +1,71 @@
+"""Tools that measure: what they say of what cannot be measured, in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from shared import Bonanza
+
+from tools import convergence_simulation, random_return
+
+
+def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
+    """What the tool exits with."""
+    monkeypatch.setattr("sys.argv", [tool.__name__, *words])
+    with pytest.raises(SystemExit) as ended:
+        tool.main()
+    assert isinstance(ended.value.code, str) and "\n" not in ended.value.code
+    return ended.value.code
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["Foo-v0", "3"], "ENVIRONMENT is 'Foo-v0', which cannot be made: "),
+        (["CartPole-v9", "3"], "ENVIRONMENT is 'CartPole-v9', which cannot be made: "),
+        (["nope:Foo-v0", "3"], "ENVIRONMENT is 'nope:Foo-v0', which cannot be made: "),
+        (["CartPole-v1", "1"], "EPISODES is 1, but should be at least 2"),
+        (["CartPole-v1", "-3"], "EPISODES is -3, but should be at least 2"),
+    ],
+)
+def test_what_has_no_random_return(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], expected: str
+) -> None:
+    said = message(monkeypatch, random_return, "--", *words)
+    assert said.startswith(f"random_return: {expected}")
+
+
+def test_a_random_return_is_that_of_random_actions(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    register: Callable[..., str],
+) -> None:
+    """Of 1000 fair choices between 0 and 1 in each episode: 500 ± √250 / √40."""
+    name = register("Bonanza-v0", Bonanza, 1000)
+    monkeypatch.setattr("sys.argv", ["random_return", name, "40"])
+    random_return.main()
+    words = capsys.readouterr().out.replace(":", "").replace(")", "").split()
+    assert words[0] == name and float(words[1]) == pytest.approx(500, abs=10)
+    assert float(words[-1]) == pytest.approx(2.5, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ([], "no ENVIRONMENT/VARIANT/seedN/episodes.csv in it"),
+        (["CartPole-v1/ppo/seed0/checkpoint.pt"], "no ENVIRONMENT/VARIANT/seedN/episodes.csv in"),
+        (["runs/CartPole-v1/ppo/seed0/episodes.csv"], "no ENVIRONMENT/VARIANT/seedN/episodes.csv"),
+        (["Foo-v0/ppo/seed0/episodes.csv"], "'metrics.random_return.Foo-v0' is missing"),
+    ],
+)
+def test_a_folder_that_gives_no_column(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: list[str], expected: str
+) -> None:
+    folder = tmp_path / "runs of a study"
+    for file in files:
+        (folder / file).parent.mkdir(parents=True)
+        (folder / file).touch()
+    said = message(monkeypatch, convergence_simulation, str(folder))
+    assert said.startswith("convergence_simulation: ") and expected in said
+    assert files == ["Foo-v0/ppo/seed0/episodes.csv"] or str(folder) in said
