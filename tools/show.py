@@ -74,8 +74,8 @@ def headline(folder: Path) -> list[str]:
         f" advantage of {100 * WORTH_MENTIONING:.0f} %. Over the paper's environments the mean"
         " return of training with the learned β differs from PPO's by"
         f" {_percent(overall['difference'])} of the way from random actions to the reference"
-        f" return (95 % interval {_percent(overall['low'])} to {_percent(overall['high'])}, at least"
-        f" {overall['seeds']} seeds in each environment)."
+        f" return (95 % interval {_percent(overall['low'])} to {_percent(overall['high'])}, at"
+        f" least {overall['seeds']} seeds in each environment)."
     ]
 
 
