@@ -74,4 +74,6 @@ def draw_growth(episodes: pd.DataFrame, scale: Scale) -> None:
     memory.set(ylabel="resident memory, MB", xlabel="environment steps")
     memory.set_ylim(0, 1.3 * episodes["memory_mb"].max())
     memory.legend()
+    for axes in (times, memory):
+        axes.locator_params(axis="x", nbins=5)
     figure.savefig(scale.pictures / "growth.png", dpi=150)

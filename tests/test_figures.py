@@ -208,6 +208,25 @@ def test_a_study_without_beta_has_a_figure_that_says_so(tmp_path):
     save_figure(figure, tmp_path / "figure.pdf")
 
 
+def test_an_inset_shows_a_beginning_in_which_most_is_learned():
+    early = {run: frame.copy() for run, frame in frames(seeds=3, episodes=200).items()}
+    for run, frame in early.items():
+        slow = run[0] == "B-v1" and run[1] == "ppo"
+        frame["extrinsic_return"] = np.minimum(np.arange(200) * (0.5 if slow else 20), 100) + run[2]
+    layout = FigureConfig(columns=3, inset=0.1)
+    figure = draw_figure(*data(runs=early), RETURN, layout, 0.95, LABELS, COLOURS)
+    first, second = figure.axes[:2]
+    assert second.child_axes == []  # of both variants one learns all along
+    [inset] = first.child_axes
+    assert inset.get_xlim() == (0, 20)
+    for line, variant in zip(inset.lines, LABELS, strict=True):
+        mean = at(data(runs=early)[0], env="A-v0", variant=variant)
+        assert list(line.get_ydata()) == list(mean[mean["episode"] <= 20]["mean"])
+        assert line.get_color() == COLOURS[variant]
+    assert "Inset: the first 10 %" in figure.legends[0].get_title().get_text()
+    assert not any(axes.child_axes for axes in draw(seeds=3).axes)
+
+
 def test_the_same_data_gives_the_same_files_and_another_colour_does_not(tmp_path, monkeypatch):
     for name, epoch, colours in (
         ("a", "0", COLOURS),

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m tools.show WHAT FOLDER [...]
 
-FOLDER is one of reference/tables, or the results of any study; of the last three reference/study
+FOLDER is one of reference/tables, or the results of any study; of the last four reference/study
 and reference/measured. WHAT is one of
 
     headline    what holds, in three sentences                                      (claims.json)
@@ -20,6 +20,7 @@ and reference/measured. WHAT is one of
     aggregate   scores between random and the best run, all environments          (aggregate.csv)
     readings    Table 1 under every reading                                         (readings.md)
     betas       the learnt β at the end of training: `betas FOLDER ENVIRONMENT ...`   (kept runs)
+    stagnation  how it goes with stagnation (C9); arguments as of betas            (kept runs)
     shares      the bonus's share of the advantages, by β                       (bonus_share.csv)
     signals     signal and noise of the credit of β                             (meta_signal.csv)
 """
@@ -40,7 +41,14 @@ import pandas as pd
 from mace_rl import files
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.claims import LEVEL, LITERAL, ROBUST, WORTH_MENTIONING, parts_table
+from mace_rl.results.claims import (
+    LEVEL,
+    LITERAL,
+    ROBUST,
+    WORTH_MENTIONING,
+    parts_table,
+    stagnation_correlation,
+)
 from mace_rl.results.metrics import final_return
 from mace_rl.results.paper import FULL, PPO
 from mace_rl.results.statistics import mean_interval, probability_of_improvement
@@ -243,15 +251,38 @@ def betas(folder: Path, *environments: str) -> list[str]:
     """The mean β of the last tenth of the episodes, of each seed, in order of size."""
     lines = ["| | seeds | β at the end |", "|---|---|---|"]
     for environment in environments:
-        kept = archive.read(folder / environment / f"{FULL}.tar.xz")
         found = sorted(
-            final_return(pd.read_csv(io.BytesIO(kept[name]))["beta"].to_numpy(), 0.1)
-            for name in kept
-            if name.endswith(files.EPISODES)
+            final_return(episodes["beta"].to_numpy(), 0.1)
+            for episodes in _learnt(folder, environment)
         )
         numbers = ", ".join(f"{beta:.2f}" for beta in found)
         lines.append(f"| {environment} | {len(found)} | {numbers} |")
     return lines
+
+
+def stagnation(folder: Path, *environments: str) -> list[str]:
+    """The correlation of stagnation with the learnt β that follows (C9): mean over seeds."""
+    lines = ["| | seeds | correlation |", "|---|---|---|"]
+    for environment in environments:
+        found = pd.Series(
+            [
+                stagnation_correlation(
+                    episodes["extrinsic_return"].to_numpy(np.float64),
+                    episodes["beta"].to_numpy(),
+                    SETTINGS.moving_average,
+                )
+                for episodes in _learnt(folder, environment)
+            ]
+        )
+        lines.append(f"| {environment} | {len(found)} | {_mean(found, '.3f')} |")
+    return lines
+
+
+def _learnt(folder: Path, environment: str) -> list[pd.DataFrame]:
+    """The episodes of the kept runs in which β was learnt, in the order of seeds."""
+    kept = archive.read(folder / environment / f"{FULL}.tar.xz")
+    names = (name for name in kept if name.endswith(files.EPISODES))
+    return [pd.read_csv(io.BytesIO(kept[name])) for name in names]
 
 
 def shares(folder: Path) -> list[str]:
@@ -297,14 +328,15 @@ def _columns(folder: Path, cell: Callable[[pd.DataFrame], str]) -> list[str]:
     return lines
 
 
-def _mean(values: pd.Series) -> str:
+def _mean(values: pd.Series, form: str = ".4g") -> str:
     """A mean over seeds with the interval of the tables."""
     numbers = values.to_numpy(np.float64)
     generator = np.random.default_rng(SETTINGS.bootstrap_seed)
     low, high = mean_interval(
         numbers, SETTINGS.confidence, SETTINGS.bootstrap_repetitions, generator
     )
-    return f"{_short(numbers.mean())} ({_short(float(low))} to {_short(float(high))})"
+    shown = [format(value, form).replace("-", "−") for value in (numbers.mean(), low, high)]
+    return f"{shown[0]} ({shown[1]} to {shown[2]})"
 
 
 def _short(value: float | str) -> str:
@@ -324,7 +356,7 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
     function.__name__: function
     for function in (
         *(headline, ledger, parts, table1, means, solved, constants, regret, improvement),
-        *(finals, together, aggregate, readings, betas, shares, signals),
+        *(finals, together, aggregate, readings, betas, stagnation, shares, signals),
     )
 }
 

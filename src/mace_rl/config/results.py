@@ -103,3 +103,5 @@ class FigureConfig(Section):
     """How the figures are laid out."""
 
     columns: PositiveInt  # panels side by side, one panel per environment
+    # This share of the episodes once more, large, where most is learned in them; None: nowhere.
+    inset: float | None = Field(default=None, gt=0, lt=1)

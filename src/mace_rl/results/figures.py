@@ -28,6 +28,7 @@ MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
+MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
 _TICKS = {"size": 3, "width": 0.8}  # points
 
 
@@ -126,8 +127,8 @@ def draw_figure(
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
     The mean over seeds is a line, its interval a band (from three seeds on), and the single seeds
-    are faint lines behind. `labels` and `colours` are those of the variants. Where there is nothing
-    to show, the figure says so.
+    are faint lines behind. `labels` and `colours` are those of the variants. Where most is learned
+    at the beginning, an inset shows that. Where there is nothing to show, the figure says so.
     """
     from matplotlib.figure import Figure
 
@@ -142,6 +143,7 @@ def draw_figure(
             panels[0].text(0.5, 0.5, f"{shown.label} is 0 in every run", ha="center", va="center")
             panels[0].set_axis_off()
             return figure
+        uneven = curves["n"].nunique() > 1
         for place, (environment, axes) in enumerate(zip(environments, panels, strict=False)):
             for variant in variants:
                 _draw(
@@ -158,9 +160,12 @@ def draw_figure(
                 axes.set_ylim(values.min() - margin, values.max() + margin)
             else:
                 axes.set_ylim(*shown.limits)
-            axes.set_xlim(0, curves.loc[curves["env"] == environment, "episode"].max())
+            own = curves[curves["env"] == environment]
+            axes.set_xlim(0, own["episode"].max())
             axes.locator_params(nbins=5)
-            axes.set_title(environment)
+            axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))
+            if layout.inset and shown.limits is None and _is_early(own, layout.inset):
+                _draw_inset(axes, own, layout.inset, colours)
             if place % columns == 0:
                 axes.set_ylabel(shown.label)
             if place + columns >= len(environments):
@@ -171,7 +176,10 @@ def draw_figure(
             *panels[0].get_legend_handles_labels(),
             loc="outside lower center",
             ncols=min(len(variants), 3),
-            title=_explanation(curves["n"].min(), curves["n"].max(), confidence),
+            title=_explanation(
+                *(curves["n"].min(), curves["n"].max(), confidence),
+                layout.inset if any(axes.child_axes for axes in panels) else None,
+            ),
         )
         for line in legend.get_lines():
             line.set_linewidth(2)
@@ -218,6 +226,31 @@ def style() -> AbstractContextManager[None]:
     )
 
 
+def _is_early(curves: "pd.DataFrame", share: float) -> bool:
+    """Whether every mean is most of its way up in the first `share` of the episodes."""
+    early = curves[curves["episode"] <= share * curves["episode"].max()]
+    lowest = curves.groupby("variant")["mean"].min()
+    risen = early.groupby("variant")["mean"].max() - lowest
+    return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
+
+
+def _draw_inset(
+    axes: "Axes", curves: "pd.DataFrame", share: float, colours: Mapping[str, str]
+) -> None:
+    """The first `share` of the episodes: means and bands."""
+    end = share * curves["episode"].max()
+    inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
+    for variant, curve in curves[curves["episode"] <= end].groupby("variant", sort=False):
+        colour = colours[str(variant)]
+        if curve["n"].max() >= BAND_SEEDS:
+            band = curve["episode"], curve["lower"], curve["upper"]
+            inset.fill_between(*band, color=colour, alpha=0.25, linewidth=0)
+        inset.plot(curve["episode"], curve["mean"], color=colour, linewidth=1)
+    inset.set_xlim(0, end)
+    inset.locator_params(nbins=3)
+    inset.tick_params(labelsize="x-small")
+
+
 def _draw(
     axes: "Axes", curve: "pd.DataFrame", runs: "pd.DataFrame", name: str, colour: str, label: str
 ) -> None:
@@ -242,10 +275,11 @@ def _select(frame: "pd.DataFrame", environment: str, variant: str) -> "pd.DataFr
     return frame[(frame["env"] == environment) & (frame["variant"] == variant)]
 
 
-def _explanation(fewest: int, seeds: int, confidence: float) -> str:
-    """The legend's title: what lines and bands are."""
+def _explanation(fewest: int, seeds: int, confidence: float, inset: float | None) -> str:
+    """The legend's title: what lines, bands and insets are."""
+    enlarged = f" Inset: the first {100 * inset:g} %." if inset else ""
     if seeds == 1:
-        return "One seed"
+        return f"One seed.{enlarged}" if inset else "One seed"
     count = f"{seeds}" if fewest == seeds else f"{fewest} to {seeds}"
     band = f" Band: its {100 * confidence:g} % interval." if seeds >= BAND_SEEDS else ""
-    return f"Line: mean over {count} seeds.{band} Faint lines: single seeds."
+    return f"Line: mean over {count} seeds.{band} Faint lines: single seeds.{enlarged}"

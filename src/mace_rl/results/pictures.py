@@ -94,7 +94,7 @@ def draw_every_seed(
                     axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colours[variant])
                 axes.set_xticks([])
                 axes.set_title(f"{environment}: {LABELS[metric].lower()}")
-        _legend(figure, grid[0, 0])
+        _legend(figure, grid[0, 0], "Dot: one seed. Line: their mean.")
     return figure
 
 
@@ -154,7 +154,8 @@ def draw_regret(
     return figure
 
 
-def _legend(figure: "Figure", panel: "Axes") -> None:
+def _legend(figure: "Figure", panel: "Axes", title: str | None = None) -> None:
     """One legend for all panels, below them."""
     handles, names = panel.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4))
+    columns = min(len(names), 4)
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, title=title)

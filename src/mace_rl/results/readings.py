@@ -250,7 +250,7 @@ def draw_readings(
                     )
             for place in range(len(lines) - 1):
                 axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
-            axes.set_xlim(left=0)
+            axes.set_xlim(left=-0.03 * axes.get_xlim()[1])  # dots at 0 are whole
             axes.locator_params(axis="x", nbins=4)
             axes.set_title(environment)
             axes.set_xlabel("Training episodes")
