@@ -525,7 +525,6 @@ def test_run_json_says_where_the_results_come_from(finished):
         ("HopperBulletEnv-v0", {}, "numpy .* adds numbers in another order"),
         ("SparseHopper-v0", {}, "numpy .* adds numbers in another order"),
         ("CartPole-v1", {"environment_arguments": {"sutton_barto_reward": True}}, "steps are not"),
-        ("Acrobot-v1", {"engine": "torch"}, "network is not a compiled one"),
     ],
 )
 def test_a_fast_path_that_is_not_taken_is_said_once(
@@ -541,10 +540,12 @@ def test_a_fast_path_that_is_not_taken_is_said_once(
 
 
 @pytest.mark.parametrize("environment", [*ENVIRONMENTS, "SparseHopper-v0", "MountainCar-v0"])
-def test_of_a_fast_path_that_is_taken_or_not_there_nothing_is_said(
-    run_config, tmp_path, caplog, environment
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_of_a_fast_path_that_is_taken_not_wanted_or_not_there_nothing_is_said(
+    run_config, tmp_path, caplog, environment, engine
 ):
-    run.run(run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20), tmp_path)
+    config = run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20, engine=engine)
+    run.run(config, tmp_path)
     assert not caplog.records
 
 

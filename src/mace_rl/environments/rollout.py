@@ -103,26 +103,25 @@ def rollout_for(
     environment: Environment, policy: ActingPolicy
 ) -> Callable[[Environment, Any, np.ndarray], Episode]:
     """The fastest rollout that is exact for this environment and this kind of policy."""
-    compiled = environment.name in COMPILED and not fallback_reason(environment, policy)
-    return roll_out_compiled if compiled else roll_out
+    made_for_it = _is_compiled(environment) and isinstance(policy, CompiledActing)
+    return roll_out_compiled if made_for_it and not fallback_reason(environment) else roll_out
 
 
-def fallback_reason(environment: Environment, policy: ActingPolicy) -> str:
-    """Why the fast path made for this environment is not taken, "" if it is or there is none.
+def fallback_reason(environment: Environment) -> str:
+    """Why the fast path made for this environment cannot be taken; "" if it can or there is none.
 
     Compiled episodes have to take the same steps as the environment, which is tried here: other
     parameters, another version or a C library with another sine all end in the ordinary rollout.
     """
     inner: Any = environment.env.unwrapped
-    if environment.name not in COMPILED:
-        return getattr(inner, "fallback_reason", "")  # `FastHopperBulletEnv` has one
-    if type(inner) is not COMPILED[environment.name]:
-        return f"the environment is of type {type(inner).__name__}, not Gymnasium's own"
-    if not isinstance(policy, CompiledActing):
-        return "the policy's network is not a compiled one"
-    if not takes_compiled_steps(inner):
-        return "the environment's steps are not equal to the compiled ones"
-    return ""
+    if _is_compiled(environment):
+        same = takes_compiled_steps(inner)
+        return "" if same else "the environment's steps are not equal to the compiled ones"
+    return getattr(inner, "fallback_reason", "")  # `FastHopperBulletEnv` has one
+
+
+def _is_compiled(environment: Environment) -> bool:
+    return type(environment.env.unwrapped) is COMPILED.get(environment.name)
 
 
 def takes_compiled_steps(inner: Any) -> bool:

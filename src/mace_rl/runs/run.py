@@ -71,7 +71,7 @@ def run(
             half_written.unlink()
         started = time.monotonic()
         trainer = Trainer(config)
-        slow = fallback_reason(trainer.environment, trainer.ppo.acting_policy())
+        slow = fallback_reason(trainer.environment)
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # what is there stays: the collector need not look through it again
