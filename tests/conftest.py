@@ -1,9 +1,14 @@
-"""What several test files share: configurations of runs, environments for a test."""
+"""Fixtures of several test files: configurations, environments for a test, interrupted runs.
 
+What takes seconds to import (torch, numba) is imported where it is used.
+"""
+
+import itertools
 import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 # As in training, here and in the processes that tests start; numpy and torch read it once.
@@ -12,6 +17,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import mace_rl  # noqa: F401  isort: skip  (arithmetic is chosen before NumPy is imported)
 
 import gymnasium
+import numpy as np
 import pytest
 
 from mace_rl.config.reading import merge_layers
@@ -62,3 +68,86 @@ def register() -> Iterator[Callable[..., str]]:
     yield make
     gymnasium.registry.clear()
     gymnasium.registry.update(before)
+
+
+@pytest.fixture
+def kill(monkeypatch):
+    """`kill(update, config, directory)`: carry out a run that dies in this update."""
+    from shared import Killed
+
+    from mace_rl.runs import run
+    from mace_rl.train import Trainer
+
+    improve = Trainer.improve
+
+    def start(number: int, config: RunConfig, directory: Path) -> None:
+        def improve_or_die(self, rollout):
+            if len(self.diagnostics) == number - 1:
+                raise Killed
+            return improve(self, rollout)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "improve", improve_or_die)
+            with pytest.raises(Killed):
+                run.run(config, directory)
+
+    return start
+
+
+@pytest.fixture
+def checkpoint_every(monkeypatch):
+    """`checkpoint_every(n)`: a checkpoint after every n-th round instead of by time."""
+    from mace_rl.runs import run
+
+    def arrange(rounds: int) -> None:
+        asked = itertools.count(1)
+        monkeypatch.setattr(run.Clock, "checkpoint_due", lambda self: next(asked) % rounds == 0)
+
+    return arrange
+
+
+@pytest.fixture
+def completes(tmp_path):
+    """`completes(config, directory)`: carry it to its end, which is that of a run never disturbed.
+
+    Bytes are compared of all that must not depend on interruptions. Returns what run.json tells.
+    """
+    from shared import OUTCOME, RESULTS, files, provenance_of
+
+    from mace_rl.runs import run
+
+    def carry_on(config: RunConfig, directory: Path) -> dict:
+        outcomes = []
+        for folder in (directory, tmp_path / "whole"):
+            run.run(config, folder)
+            assert files(folder) == RESULTS
+            outcomes.append([(folder / name).read_bytes() for name in OUTCOME])
+        assert outcomes[0] == outcomes[1]
+        return provenance_of(directory)
+
+    return carry_on
+
+
+@pytest.fixture
+def interrupted(run_config, tmp_path, kill, checkpoint_every):
+    """A run of CartPole-v1, killed after a checkpoint: its configuration and folder."""
+    config = run_config("CartPole-v1", "mace_full", 0, episodes=6)
+    checkpoint_every(1)
+    kill(5, config, tmp_path / "run")
+    return SimpleNamespace(config=config, directory=tmp_path / "run")
+
+
+@pytest.fixture
+def learnt(monkeypatch) -> list[np.ndarray]:
+    """The gradients that reach optimisers, as they come."""
+    from mace_rl.agent.adam import Adam
+
+    gradients = []
+    step = Adam.step
+
+    def note(self: Adam, gradient: np.ndarray) -> float:
+        gradients.append(gradient.copy())
+        return step(self, gradient)
+
+    monkeypatch.setattr(Adam, "step", note)
+    return gradients

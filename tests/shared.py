@@ -1,7 +1,10 @@
-"""What the tests of learning share: an independent derivative, environments, finished runs."""
+"""What several test files share: an independent derivative, environments, runs, the command."""
 
 import copy
+import json
+import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -9,6 +12,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
 
+from mace_rl import cli
 from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork
 from mace_rl.agent.policy import Policy
 from mace_rl.config.run import RunConfig
@@ -16,8 +20,17 @@ from mace_rl.environments.environment import Environment
 from mace_rl.train import Trainer
 
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
+ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
 VARIANTS = ["ppo", "mace_fixed", "mace_full"]
 LAYER_NORM = {"kind": "torch", "module": "shared:layer_norm"}  # as `ppo.network`
+
+# What is in the folder of a run, at its end and before.
+OUTCOME = ["agent.pt", "diagnostics.csv", "episodes.csv"]
+RESULTS = [*OUTCOME, "run.json"]
+UNFINISHED = ["checkpoint.pt", "progress.json"]
+
+# Options of `mace-rl train` that are good.
+GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes": "3"}
 
 
 class Twin:
@@ -57,6 +70,11 @@ class Twin:
         return torch.distributions.Categorical(logits=outputs)
 
 
+def beta_of(twin: Twin, sequence: np.ndarray) -> torch.Tensor:
+    """The logistic function of the reference network's answer to what an episode was, [1]."""
+    return torch.sigmoid(twin(sequence))
+
+
 def layer_norm(inputs: int, outputs: int, hidden_units: list[int]) -> torch.nn.Module:
     """A network of a user's own."""
     units = hidden_units[0]
@@ -79,6 +97,28 @@ def finish(run: RunConfig | Trainer) -> Trainer:
     for _ in trainer.run():
         pass
     return trainer
+
+
+class Killed(BaseException):
+    """Ends a run as a signal would: nothing in the program catches it."""
+
+
+def files(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def provenance_of(directory: Path) -> dict:
+    return json.loads((directory / "run.json").read_text(encoding="utf-8"))
+
+
+def call(monkeypatch, *words: str) -> tuple[int, str]:
+    """Exit code and message of `mace-rl words`."""
+    monkeypatch.setattr(sys, "argv", ["mace-rl", *words])
+    try:
+        cli.main()
+    except SystemExit as exit_:
+        return (exit_.code, "") if isinstance(exit_.code, int) else (1, str(exit_.code))
+    return 0, ""
 
 
 class Bonanza(gymnasium.Env):

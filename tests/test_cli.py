@@ -3,7 +3,6 @@
 import argparse
 import json
 import shlex
-import shutil
 import subprocess
 import sys
 
@@ -11,6 +10,7 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from shared import GOOD, call
 from snakemake.utils import update_config
 
 from mace_rl import cli
@@ -18,19 +18,6 @@ from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 
 CONFIG = yaml.safe_load(cli.CONFIG.read_text(encoding="utf-8"))
-
-
-def call(monkeypatch, *words: str) -> tuple[int, str]:
-    """Exit code and message of `mace-rl words`."""
-    monkeypatch.setattr(sys, "argv", ["mace-rl", *words])
-    try:
-        cli.main()
-    except SystemExit as exit_:
-        return (exit_.code, "") if isinstance(exit_.code, int) else (1, str(exit_.code))
-    return 0, ""
-
-
-GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes": "3"}
 
 # What is changed in a good command, and what the message has to name.
 MISTAKES = {
@@ -322,84 +309,6 @@ def test_a_run_is_finished_for_another_process_too(tmp_path):
         assert done.returncode == 0 and expected in done.stderr, done.stderr
 
 
-@pytest.fixture
-def reference(monkeypatch, tmp_path):
-    """A folder with one kept run."""
-    folder = tmp_path / "runs/CartPole-v1/ppo/seed0"
-    options = sum((GOOD | {"--out": str(folder)}).items(), ())
-    assert call(monkeypatch, "train", *options) == (0, "")
-    return tmp_path
-
-
-def test_an_agent_plays_as_at_the_end_of_its_training(monkeypatch, tmp_path, capsys):
-    """Its return is that of its torch modules in the library's own environment."""
-    import gymnasium
-    import numpy as np
-    import torch
-
-    from mace_rl.runs.agent import load_agent
-    from mace_rl.runs.evaluate import evaluate
-
-    options = GOOD | {"--env": "HopperBulletEnv-v0", "--episodes": "6", "--out": str(tmp_path)}
-    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
-    assert call(monkeypatch, "evaluate", str(tmp_path), "--episodes", "3") == (0, "")
-    assert capsys.readouterr().out.startswith("3 episodes: mean return ")
-    policy, env = load_agent(tmp_path).policy, gymnasium.make("HopperBulletEnv-v0")
-    noise = torch.from_numpy(np.random.default_rng(5).standard_normal((1000, 3)))
-    env.reset(seed=5)  # an environment's first reset is thrown away
-    env.reset(seed=5)
-    observation, _ = env.reset()
-    total = 0.0
-    for row in noise:
-        distribution = policy(observation)
-        action = (distribution.mean + distribution.stddev * row).detach().clip(-1, 1)
-        observation, reward, *ends, _ = env.step(action.float().numpy())
-        total += reward
-        if any(ends):
-            break
-    assert evaluate(tmp_path, 1, 5)[0] == pytest.approx(total, rel=1e-3)
-    (tmp_path / "agent.pt").write_bytes((tmp_path / "agent.pt").read_bytes()[:-7])
-    code, message = call(monkeypatch, "evaluate", str(tmp_path))
-    assert code == 1 and "agent.pt" in message and "cut off" in message
-
-
-@pytest.mark.parametrize("engine", ["compiled", "torch"])
-@pytest.mark.parametrize(
-    ("environment", "action"),
-    [
-        ("CartPole-v1", lambda policy: int(policy.probs.argmax())),
-        ("HopperBulletEnv-v0", lambda policy: policy.mean.numpy().clip(-1, 1)),
-    ],
-)
-def test_without_chance_an_agent_takes_its_most_probable_actions(
-    monkeypatch, tmp_path, environment, action, engine
-):
-    """As torch's distribution has them, in the library's own environment."""
-    import gymnasium
-    import torch
-
-    from mace_rl.runs.agent import load_agent
-    from mace_rl.runs.evaluate import evaluate
-
-    options = GOOD | {"--env": environment, "--engine": engine, "--out": str(tmp_path)}
-    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
-    policy, env = load_agent(tmp_path).policy, gymnasium.make(environment)
-    env.reset(seed=5)  # an environment's first reset is thrown away
-    env.reset(seed=5)
-    expected = []
-    for _ in range(3):
-        observation, _ = env.reset()
-        expected.append(0.0)
-        ends = [False]
-        while not any(ends):
-            with torch.no_grad():
-                chosen = action(policy(observation))
-            observation, reward, *ends, _ = env.step(chosen)
-            expected[-1] += reward
-    assert evaluate(tmp_path, 3, 5, deterministic=True) == pytest.approx(expected, rel=1e-3)
-    assert evaluate(tmp_path, 3, 5).tolist() != pytest.approx(expected, rel=1e-3)
-
-
 UNFIT = {  # an option's value, and what would be right
     ("watch", "--out", "a.mp4"): "'a.mp4', but should end in .gif",
     ("watch", "--seconds", "0"): "0.0, but should be greater than 0",
@@ -422,17 +331,6 @@ def test_a_mistaken_value_of_an_option_is_named_alone(monkeypatch, tmp_path, com
     assert call(monkeypatch, name, str(tmp_path), option, value) == (1, expected)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "watch"])
-@pytest.mark.parametrize("folder", ["nope", "unfinished", "a file"])
-def test_without_a_finished_run_nothing_is_played(monkeypatch, tmp_path, command, folder):
-    (tmp_path / "unfinished").mkdir()
-    (tmp_path / "unfinished/checkpoint.pt").touch()
-    (tmp_path / "a file").touch()
-    path = tmp_path / folder
-    expected = f"mace-rl: no finished run in {path}: it has no run.json"
-    assert call(monkeypatch, command, str(path)) == (1, expected)
-
-
 @pytest.mark.parametrize("command", subcommands())
 def test_only_training_resumes_after_an_interruption(monkeypatch, caplog, command):
     def interrupted(_) -> None:
@@ -444,53 +342,3 @@ def test_only_training_resumes_after_an_interruption(monkeypatch, caplog, comman
     assert call(monkeypatch, command, *needed) == (130, "")
     resumes = "; the same command resumes it" if command == "train" else ""
     assert caplog.messages == ["interrupted" + resumes]
-
-
-def test_a_kept_run_is_verified_to_the_bit(reference, monkeypatch, capsys):
-    assert call(monkeypatch, "verify", str(reference)) == (0, "")
-    assert capsys.readouterr().out.splitlines() == [
-        "CartPole-v1 ppo seed 0: equal to the bit",
-        "1 of 1 runs equal to the bit",
-    ]
-
-
-def test_verify_says_what_is_different(reference, monkeypatch, capsys):
-    path = reference / "runs/CartPole-v1/ppo/seed0/run.json"
-    record = json.loads(path.read_text(encoding="utf-8"))
-    record["config"]["seed"] = 1
-    record["machine"]["cpu"] = "Z80"
-    path.write_text(json.dumps(record), encoding="utf-8")
-    code, message = call(monkeypatch, "verify", str(reference))
-    assert code == 1 and "not reproduced: 0 of 1" in message
-    assert "different from episode 1" in (out := capsys.readouterr().out) and "Z80" in out
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda run: (run / "run.json").write_text("{", encoding="utf-8"),
-        lambda run: (run / "run.json").write_text("{}", encoding="utf-8"),
-        lambda run: (run / "episodes.csv").unlink(),
-        lambda run: (run / "episodes.csv").write_bytes(
-            (run / "episodes.csv").read_bytes().replace(b",1\n", b",0\n", 1)
-        ),
-        lambda run: shutil.rmtree(run),
-    ],
-)
-def test_damaged_references_are_refused(damage, reference, monkeypatch):
-    damage(reference / "runs/CartPole-v1/ppo/seed0")
-    code, message = call(monkeypatch, "verify", str(reference))
-    assert code == 1 and str(reference) in message and "\n" not in message
-
-
-def test_verify_counts_agreement_by_hand():
-    from mace_rl.runs.verify import Repetition, verdict
-
-    def run(then: float, now: float, equal: bool = False) -> Repetition:
-        return Repetition("a run", equal, None if equal else 1, (then, now), 2.0, "cpu")
-
-    assert verdict([run(1, 1, True)] * 3, 0.95) == (True, "3 of 3 runs equal to the bit")
-    # Changes of -1, 1 and 0 spreads: their mean is 0. Changes of 1, 1.1 and 0.9: clearly not.
-    assert verdict([run(10, 8), run(10, 12), run(5, 5)], 0.95)[0]
-    assert not verdict([run(10, 12), run(10, 12.2), run(5, 6.8)], 0.95)[0]
-    assert not verdict([run(10, 12), run(1, 1, True)], 0.95)[0]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from shared import GOOD, call
 from tensorboardX.proto.event_pb2 import Event
-from test_cli import GOOD, call
 
 from mace_rl import files
 from mace_rl.runs import checkpoint

@@ -7,7 +7,7 @@ from types import ModuleType
 import pytest
 from shared import Bonanza
 
-from tools import convergence_simulation, random_return
+from tools import convergence_simulation, random_return, show
 
 
 def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
@@ -48,6 +48,25 @@ def test_a_random_return_is_that_of_random_actions(
     words = capsys.readouterr().out.replace(":", "").replace(")", "").split()
     assert words[0] == name and float(words[1]) == pytest.approx(500, abs=10)
     assert float(words[-1]) == pytest.approx(2.5, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["ledger", "nowhere"], "nowhere/claims.json: No such file or directory"),
+        (["means", "study", "speed"], "there is no 'speed' in what study has"),
+        (["parts", "study", "fancy"], "there is no 'fancy' in what study has"),
+        (["improvement", "study", "speed"], "study/comparisons.csv has no metric 'speed'"),
+        (["ledger", "study", "more"], "ledger does not take 'more'"),
+        (["together", "study"], "together wants a variant and those to compare it with"),
+        (["together", "study", "ppo", "other"], "no environment has runs of both 'ppo' and"),
+    ],
+)
+def test_what_is_not_there_to_be_shown(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], expected: str
+) -> None:
+    monkeypatch.chdir(Path(__file__).parents[1] / "reference" / "tables")
+    assert message(monkeypatch, show, *words).startswith(f"show: {expected}")
 
 
 @pytest.mark.parametrize(

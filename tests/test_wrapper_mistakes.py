@@ -10,13 +10,13 @@ import yaml
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_util import make_vec_env
+from wrapped import BANDIT, play, vector_of
 
 import mace_rl.environments  # noqa: F401  (registers ours)
 from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import MEMORY, NOVELTY, CuriosityConfig
 from mace_rl.finite import NonFiniteError
 from mace_rl.wrappers import CuriosityReward, VectorCuriosityReward
-from tests.test_wrappers import BANDIT, play, vector_of
 
 ROOT = Path(__file__).parents[1]
 

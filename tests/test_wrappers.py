@@ -1,8 +1,6 @@
-"""Curiosity for other agents: what is paid, by the trainer's own bonus; checkers; resuming."""
+"""Curiosity for other agents: what is paid, as by the trainer's own bonus; β; checkers."""
 
-import copy
 import io
-import re
 
 import gymnasium
 import numpy as np
@@ -10,8 +8,8 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from wrapped import BANDIT, ENVIRONMENTS, RANDOM, SMALL, play, step
 
 import mace_rl.environments  # noqa: F401  (registers ours)
 from mace_rl import wrappers
@@ -20,59 +18,12 @@ from mace_rl.beta.controls import RandomDraw
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.novelty import Novelty
 from mace_rl.config.run import MemoryConfig, NoveltyConfig, RandomBeta
-from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import MEMORY, NOVELTY
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
 from mace_rl.streams import Streams
-from mace_rl.wrappers import CuriosityReward, VectorCuriosityReward
-
-# Limits small enough that the buffer and the memory get full within a test, and replace what they
-# hold.
-SMALL = {
-    "memory": {"capacity": 60, "write_every": 3},
-    "novelty": {"buffer_size": 120, "write_every": 2, "neighbours": [3, 8, 5]},
-}
-RANDOM = {"kind": "random", "low": 0.2, "high": 0.7}
-BANDIT = {"kind": "bandit", "arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
-ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "DeepSea10-v0"]
-
-
-def step(env, number: int):
-    """A step with an action that depends on its number alone."""
-    space = env.action_space
-    rng = np.random.default_rng(number)
-    if isinstance(space, Discrete):
-        return env.step(int(rng.integers(space.n)))
-    return env.step(rng.uniform(space.low, space.high).astype(np.float32))
-
-
-def play(env, steps: int, seed: int = 0) -> list[tuple]:
-    """What so many steps returned, episode after episode."""
-    env.reset(seed=seed)
-    found = []
-    for number in range(steps):
-        found.append(copy.deepcopy(step(env, number)))
-        if found[-1][2] or found[-1][3]:
-            env.reset()
-    return found
-
-
-def vector_of(name: str, count: int, mode: AutoresetMode) -> SyncVectorEnv:
-    makers = [lambda: gymnasium.make(name) for _ in range(count)]
-    return SyncVectorEnv(makers, autoreset_mode=mode)
-
-
-def play_vector(env, steps: int, seed: int = 0) -> list[tuple]:
-    """The same of several environments, with the same actions in each as `play` would take."""
-    env.reset(seed=seed)
-    found = []
-    for number in range(steps):
-        action = np.random.default_rng(number).integers(env.single_action_space.n)
-        found.append(copy.deepcopy(env.step(np.full(env.num_envs, action))))
-    return found
-
+from mace_rl.wrappers import CuriosityReward
 
 # --- What is paid -------------------------------------------------------------------------------
 
@@ -350,166 +301,3 @@ def test_step_before_reset_and_after_the_end_is_an_error():
     env.env.steps_beyond_terminated = None  # no warning of the environment's own
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
         env.step(0)
-
-
-# --- Several environments -----------------------------------------------------------------------
-
-MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
-
-
-@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
-@pytest.mark.parametrize("mode", MODES)
-def test_vector_form_of_one_equals_the_single_form(name, mode):
-    inside = SyncVectorEnv(
-        [lambda: CuriosityReward(gymnasium.make(name), RANDOM, seed=2)], autoreset_mode=mode
-    )
-    outside = VectorCuriosityReward(vector_of(name, 1, mode), RANDOM, seed=2)
-    ends = 0
-    for one, other in zip(play_vector(inside, 400), play_vector(outside, 400), strict=True):
-        for part in range(4):
-            np.testing.assert_array_equal(one[part], other[part])
-        told = one[4]
-        if mode is AutoresetMode.SAME_STEP and (one[2] | one[3]).any():
-            told, ends = one[4]["final_info"], ends + 1
-        for name_ in wrappers.PARTS:
-            mask = other[4][f"_{name_}"]
-            assert mask.tolist() == told.get(f"_{name_}", np.zeros(1, bool)).tolist()
-            if mask.any():
-                np.testing.assert_array_equal(told[name_], other[4][name_])
-    assert mode is AutoresetMode.NEXT_STEP or ends > 3
-
-
-@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
-def test_modes_of_autoreset_pay_alike(name):
-    """Three environments, whose resets take a step of their own or none: the same episodes."""
-
-    def episodes(mode):
-        env = VectorCuriosityReward(vector_of(name, 1, mode))
-        env.reset(seed=7)
-        numbers, found = iter(range(10**6)), []
-        waiting = False
-        while len(found) < 300:
-            action = 0 if waiting else np.random.default_rng(next(numbers)).integers(2)
-            _, reward, terminated, truncated, info = env.step(np.array([action]))
-            if not waiting:
-                found.append((reward[0], info["curiosity"][0]))
-            ended = bool(terminated[0] or truncated[0])
-            waiting = ended and mode is AutoresetMode.NEXT_STEP
-            if ended and mode is AutoresetMode.DISABLED:
-                env.reset(options={"reset_mask": np.array([True])})
-        return found
-
-    next_step, same_step, disabled = (episodes(mode) for mode in AutoresetMode)
-    assert next_step == same_step == disabled
-
-
-def test_what_one_environment_has_seen_is_known_to_the_others():
-    """Three chains side by side, whose episodes of 10 steps end together, one after the other."""
-    env = VectorCuriosityReward(vector_of("DeepSea10-v0", 3, AutoresetMode.SAME_STEP))
-    found = play_vector(env, 10)
-    assert all(info["novelty"].tolist() == [1, 1, 1] for *_, info in found)
-    again = env.step(np.full(3, np.random.default_rng(0).integers(2)))
-    count = sum(0.9995**k for k in (1, 2, 3))  # of the state that the first steps led to
-    assert again[4]["novelty"] == pytest.approx(np.full(3, 1 / (count + 1)))
-    # One step in 10 of these 30, and the last of each episode.
-    assert len(env.appraisal.curiosity.curiosity.memory) == 3 + 3
-
-
-def test_environments_that_end_at_other_times_keep_their_own_episodes():
-    env = VectorCuriosityReward(vector_of("CartPole-v1", 3, AutoresetMode.NEXT_STEP))
-    remembered = []
-    remember = env.appraisal.curiosity.remember
-    env.appraisal.curiosity.remember = lambda *given: (remembered.append(given), remember(*given))
-    found = play_vector(env, 300)
-    for i in range(3):
-        lengths, length = [], 0
-        for _, _, terminated, truncated, info in found:
-            length += int(info["_curiosity"][i])
-            if terminated[i] or truncated[i]:
-                lengths.append(length)
-                length = 0
-        assert len(lengths) > 5
-    starts = {episode.observations[0].tobytes() for episode, _ in remembered}
-    assert len(starts) == len(remembered) > 15
-    for episode, returns in remembered:  # 1 a step: (1 - γ^n) / (1 - γ) with n steps to go
-        to_go = np.arange(len(episode), 0, -1)
-        np.testing.assert_allclose(returns, (1 - 0.99**to_go) / (1 - 0.99))
-        moved = np.diff(episode.observations[:, 0])  # 0.02 s at the velocity before the step
-        np.testing.assert_allclose(moved, 0.02 * episode.observations[:-1, 1], atol=1e-6)
-
-
-# --- Resuming -----------------------------------------------------------------------------------
-
-
-def saved(state: dict) -> dict:
-    """Through a file's bytes."""
-    return torch.load(io.BytesIO(archive(state)), weights_only=True)
-
-
-@pytest.mark.parametrize("steps", [0, 7, 333, 600])
-@pytest.mark.parametrize(
-    ("name", "beta"), list(zip(ENVIRONMENTS, [0.4, RANDOM, BANDIT, 1], strict=True))
-)
-def test_saved_midway_it_continues_to_the_bit(name, beta, steps):
-    original = CuriosityReward(gymnasium.make(name), beta, seed=1, **SMALL)
-    play(original, steps)
-    state = saved(original.state_dict())
-    restored = CuriosityReward(copy.deepcopy(original.env), beta, seed=99, **SMALL)
-    restored.load_state_dict(state)
-    for number in range(500):
-        one, other = step(original, 1000 + number), step(restored, 1000 + number)
-        np.testing.assert_equal(one, other)
-        if one[2] or one[3]:
-            original.reset()
-            restored.reset()
-    assert archive(original.state_dict()) == archive(restored.state_dict())
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_vector_form_saved_midway_continues_to_the_bit(mode):
-    env, action = vector_of("CartPole-v1", 3, mode), np.random.default_rng(0)
-    original = VectorCuriosityReward(env, RANDOM, **SMALL)
-    play_vector(original, 200)
-    restored = VectorCuriosityReward(copy.deepcopy(env), RANDOM, seed=9, **SMALL)
-    restored.load_state_dict(saved(original.state_dict()))
-    for _ in range(200):
-        actions = action.integers(2, size=3)
-        one, other = original.step(actions), restored.step(actions)
-        np.testing.assert_equal(one[:4], other[:4])
-        for part in wrappers.PARTS:
-            np.testing.assert_array_equal(one[4][part], other[4][part])
-
-
-def test_a_state_stays_as_it_was_while_the_training_goes_on():
-    env = CuriosityReward(gymnasium.make("CartPole-v1"), BANDIT, **SMALL)
-    play(env, 300)
-    state = env.state_dict()
-    before = archive(copy.deepcopy(state))
-    play(env, 300)
-    assert archive(state) == before
-    env.load_state_dict(state)
-    play(env, 300)
-    assert archive(state) == before
-
-
-def test_a_state_made_with_other_settings_is_refused():
-    state = CuriosityReward(gymnasium.make("CartPole-v1")).state_dict()
-    message = re.escape("made with beta {'kind': 'constant', 'value': 0.4}, but here it is")
-    with pytest.raises(ConfigError, match=message):
-        CuriosityReward(gymnasium.make("CartPole-v1"), 0.5).load_state_dict(state)
-    with pytest.raises(ConfigError, match="made with observation_size 4, but here it is 6"):
-        CuriosityReward(gymnasium.make("Acrobot-v1")).load_state_dict(state)
-    two = VectorCuriosityReward(vector_of("CartPole-v1", 2, AutoresetMode.NEXT_STEP))
-    with pytest.raises(ConfigError, match="made with environments 1, but here it is 2"):
-        two.load_state_dict(state)
-    state["settings"]["curves"] = 3  # as a later version could have it
-    with pytest.raises(ConfigError, match="made with curves 3, which is no setting here"):
-        CuriosityReward(gymnasium.make("CartPole-v1")).load_state_dict(state)
-
-
-def test_equal_seeds_give_equal_rewards_and_others_do_not():
-    first, second, third = (
-        [item[1] for item in play(CuriosityReward(gymnasium.make("Acrobot-v1"), seed=seed), 1500)]
-        for seed in (1, 1, 2)
-    )
-    assert first == second != third

@@ -382,7 +382,7 @@ def main() -> None:
     except OSError as error:
         sys.exit(f"show: {error.filename}: {error.strerror}")
     except KeyError as error:
-        sys.exit(f"show: {arguments.folder} has no column {error}")
+        sys.exit(f"show: there is no {error} in what {arguments.folder} has")
     print("\n".join(lines))
 
 

@@ -60,9 +60,10 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     One `Comparison` per environment, metric and configured pair of variants that are both there;
     then one per metric and pair for all environments together, if there are several.
     """
-    groups = [[runs] for _, runs in table.groupby("env", sort=False)]
+    tables = {str(env): _by_variant(runs) for env, runs in table.groupby("env", sort=False)}
+    groups = [{env: runs} for env, runs in tables.items()]
     if len(groups) > 1:
-        groups.append([runs for (runs,) in groups])
+        groups.append(tables)
     rows = [
         _compare(environments, metric, pair, settings)
         for environments in groups
@@ -76,53 +77,58 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return frame
 
 
+def _by_variant(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """The rows of each variant in the order of the seeds, which all variants share."""
+    ordered = runs.sort_values("seed")
+    return {str(name): rows for name, rows in ordered.groupby("variant", sort=False)}
+
+
 def _compare(
-    environments: list[pd.DataFrame], metric: Metric, pair: list[str], settings: MetricsConfig
+    environments: dict[str, dict[str, pd.DataFrame]],
+    metric: Metric,
+    pair: list[str],
+    settings: MetricsConfig,
 ) -> Comparison:
-    """One row, but for `p_holm`, from the rows of metrics.csv of each environment.
+    """One row, but for `p_holm`, from the rows of metrics.csv by environment and variant.
 
     All runs are censored at the same episode E. Restricted to E, the mean ∫₀ᴱ S(t) dt of Kaplan's
     and Meier's estimate S is then the mean of the runs, with E for those that never got there.
     """
     how = (settings.confidence, settings.bootstrap_repetitions)
     seed = settings.bootstrap_seed  # of a generator for each: no cell depends on another
-    runs = [frame[frame["variant"].isin(pair)] for frame in environments]
-    reached = [_reached(frame, metric, pair) for frame in runs]
-    restricted = [
-        [np.where(np.isinf(values), frame["episodes"].min(), values) for values in both]
-        for both, frame in zip(reached, runs, strict=True)
-    ]
+    variant, baseline = pair
+    reached, restricted = [], []
+    for runs in environments.values():
+        both = runs[variant], runs[baseline]
+        budget = min(int(rows["episodes"].min()) for rows in both)
+        x, y = (_reached(rows, metric, budget) for rows in both)
+        reached.append((x, y))
+        restricted.append((np.where(np.isinf(x), budget, x), np.where(np.isinf(y), budget, y)))
     sign = -1 if metric.unit == "episodes" else 1  # greater is better
     better = probability_of_improvement(
         [(sign * x, sign * y) for x, y in restricted], *how, np.random.default_rng(seed)
     )
     censored = sum(int(np.isinf(values).sum()) for both in reached for values in both)
-    counts = min(len(both[0]) for both in reached), censored
-    variant, baseline = pair
+    counts = min(len(x) for x, _ in reached), censored
     row = Comparison(*(ALL, metric.name, variant, baseline, *counts, *UNTESTED, np.nan, *better))
-    if len(runs) > 1:
+    if len(environments) > 1:
         return row
-    x, y = restricted[0]
+    [(x, y)] = restricted
     compared = paired_comparison(x, y, *how, np.random.default_rng(seed))
-    row = row._replace(env=str(runs[0]["env"].iloc[0]), test="sign-flip", **compared._asdict())
+    row = row._replace(env=next(iter(environments)), test="sign-flip", **compared._asdict())
     if metric.unit == "episodes":
         p_value = logrank(*reached[0], how[1], np.random.default_rng(seed))
         row = row._replace(test="log-rank", p_value=p_value)
     return row
 
 
-def _reached(runs: pd.DataFrame, metric: Metric, pair: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """The metric's values of both variants, [seeds] each, in the order of the seeds.
-
-    Of episodes, np.inf if never reached in the budget that both have.
-    """
-    values = runs[metric.name].astype(np.float64)
-    if metric.unit == "episodes":
-        in_budget = values <= runs["episodes"].min()
-        values = values.where(in_budget & (runs[metric.flag] == 0), np.inf)
-    wide = runs.assign(value=values).pivot(index="seed", columns="variant", values="value")
-    variant, baseline = pair
-    return wide[variant].to_numpy(), wide[baseline].to_numpy()
+def _reached(runs: pd.DataFrame, metric: Metric, budget: int) -> np.ndarray:
+    """The metric's values of one variant, [seeds]; of episodes, np.inf if not in the budget."""
+    values = runs[metric.name].to_numpy(np.float64)
+    if metric.unit != "episodes":
+        return values
+    in_budget = (values <= budget) & (runs[metric.flag].to_numpy() == 0)
+    return np.where(in_budget, values, np.inf)
 
 
 def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
