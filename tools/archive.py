@@ -27,7 +27,10 @@ AT_PLAY = "seed0"
 
 def read(archive: Path) -> dict[str, bytes]:
     """What is in an archive, by name."""
-    with tarfile.open(archive, "r:xz") as tar:
+    content = lzma.decompress(
+        archive.read_bytes()
+    )  # at once: tarfile's own way takes twice as long
+    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
         files_in_it = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
         return {name: file.read() for name, file in files_in_it if file is not None}
 

@@ -79,7 +79,7 @@ SHAPES = {  # noise, mean return of each episode, mean return of random actions
 def after_the_steepest(curve: m.LearningCurve, share: float) -> m.Episode:
     """First slope ≤ share of the steepest, after it."""
     window = curve.settings.moving_average
-    slopes = m.slope(curve.returns, window)
+    slopes = curve.slopes
     place = int(np.argmax(slopes))
     return curve.first(slopes[place:] <= share * slopes[place], 2 * window + place)
 
@@ -87,7 +87,7 @@ def after_the_steepest(curve: m.LearningCurve, share: float) -> m.Episode:
 def for_good(curve: m.LearningCurve, share: float) -> m.Episode:
     """From here on no slope > share of the steepest."""
     window = curve.settings.moving_average
-    slopes = m.slope(curve.returns, window)
+    slopes = curve.slopes
     low = np.logical_and.accumulate((slopes <= share * slopes.max())[::-1])[::-1]
     return curve.first(low, 2 * window)
 

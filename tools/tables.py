@@ -22,6 +22,7 @@ import snakemake.cli
 
 import mace_rl.config.study  # noqa: F401 - likewise
 from mace_rl.config.reading import read_yaml
+from mace_rl.sources import digest
 from tools import archive
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -57,8 +58,11 @@ def make(name: str, study: dict[str, Any]) -> None:
 def make_all(studies: dict[str, Any]) -> None:
     """Make the outputs of every study, as many studies at once as there are cores.
 
-    Each in a process forked from this one: Snakemake's imports take longer than most of them.
+    Each in a process forked from this one, which has done what Snakemake begins with every time:
+    its imports, its plugins, and parsing what digests are of.
     """
+    snakemake.cli.get_argument_parser()
+    digest(*Path("workflow/scripts").glob("*.py"))
     fork = multiprocessing.get_context("fork")
     waiting = [(name, fork.Process(target=make, args=(name, studies[name]))) for name in studies]
     running: dict[Any, tuple[str, Any]] = {}  # by what is ready when the process ends

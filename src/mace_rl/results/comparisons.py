@@ -1,5 +1,7 @@
 """Is one variant better than another? Compared by environment and metric (docs/metrics.md)."""
 
+from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +13,9 @@ from mace_rl.results.statistics import (
     draws,
     holm,
     logrank,
-    paired_comparison,
+    paired_comparisons,
     percentiles,
-    probability_of_improvement,
+    probabilities_of_improvement,
 )
 
 ALL = "all"  # in the place of an environment: the mean over all of them
@@ -60,75 +62,77 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     One `Comparison` per environment, metric and configured pair of variants that are both there;
     then one per metric and pair for all environments together, if there are several.
     """
-    tables = {str(env): _by_variant(runs) for env, runs in table.groupby("env", sort=False)}
-    groups = [{env: runs} for env, runs in tables.items()]
+    variants = set(table["variant"])
+    pairs = [pair for pair in settings.comparisons if variants.issuperset(pair)]
+    by_environment = {
+        str(env): {str(name): own for name, own in runs.sort_values("seed").groupby("variant")}
+        for env, runs in table.groupby("env", sort=False)
+    }
+    groups = [{env: runs} for env, runs in by_environment.items()]
     if len(groups) > 1:
-        groups.append(tables)
-    rows = [
-        _compare(environments, metric, pair, settings)
-        for environments in groups
-        for metric in all_metrics(settings)
-        for pair in settings.comparisons
-        if set(pair) <= set(table["variant"])
-    ]
+        groups.append(by_environment)
+    rows: list[Comparison] = []
+    for environments in groups:
+        compared = [_compare(environments, pair, settings) for pair in pairs]
+        rows.extend(chain.from_iterable(zip(*compared, strict=True)))  # metric by metric
     frame = pd.DataFrame(rows, columns=Comparison._fields)
     tested = frame["p_value"].notna()
     frame.loc[tested, "p_holm"] = holm(frame.loc[tested, "p_value"].to_list())
     return frame
 
 
-def _by_variant(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """The rows of each variant in the order of the seeds, which all variants share."""
-    ordered = runs.sort_values("seed")
-    return {str(name): rows for name, rows in ordered.groupby("variant", sort=False)}
-
-
 def _compare(
     environments: dict[str, dict[str, pd.DataFrame]],
-    metric: Metric,
     pair: list[str],
     settings: MetricsConfig,
-) -> Comparison:
-    """One row, but for `p_holm`, from the rows of metrics.csv by environment and variant.
+) -> list[Comparison]:
+    """A row for each metric, but for `p_holm`, from metrics.csv by environment and variant.
 
     All runs are censored at the same episode E. Restricted to E, the mean ∫₀ᴱ S(t) dt of Kaplan's
     and Meier's estimate S is then the mean of the runs, with E for those that never got there.
     """
+    (variant, baseline), metrics = pair, all_metrics(settings)
     how = (settings.confidence, settings.bootstrap_repetitions)
-    seed = settings.bootstrap_seed  # of a generator for each: no cell depends on another
-    variant, baseline = pair
-    reached, restricted = [], []
+    seed = settings.bootstrap_seed  # of a generator for each: no row depends on another
+    signs = [-1 if metric.unit == "episodes" else 1 for metric in metrics]  # greater is better
+    reached, restricted = [], []  # of each environment: both variants' [seeds, metrics]
     for runs in environments.values():
         both = runs[variant], runs[baseline]
-        budget = min(int(rows["episodes"].min()) for rows in both)
-        x, y = (_reached(rows, metric, budget) for rows in both)
+        budget = min(int(own["episodes"].min()) for own in both)
+        x, y = (_reached(own, metrics, budget) for own in both)
         reached.append((x, y))
         restricted.append((np.where(np.isinf(x), budget, x), np.where(np.isinf(y), budget, y)))
-    sign = -1 if metric.unit == "episodes" else 1  # greater is better
-    better = probability_of_improvement(
-        [(sign * x, sign * y) for x, y in restricted], *how, np.random.default_rng(seed)
+    better = probabilities_of_improvement(
+        [(x * signs, y * signs) for x, y in restricted], *how, np.random.default_rng(seed)
     )
-    censored = sum(int(np.isinf(values).sum()) for both in reached for values in both)
-    counts = min(len(x) for x, _ in reached), censored
-    row = Comparison(*(ALL, metric.name, variant, baseline, *counts, *UNTESTED, np.nan, *better))
+    censored = sum(np.isinf(values).sum(axis=0) for both in reached for values in both)
+    seeds = min(len(x) for x, _ in reached)
+    rows = [
+        Comparison(ALL, metric.name, variant, baseline, seeds, int(never), *UNTESTED, np.nan, *one)
+        for metric, never, one in zip(metrics, censored, better, strict=True)
+    ]
     if len(environments) > 1:
-        return row
-    [(x, y)] = restricted
-    compared = paired_comparison(x, y, *how, np.random.default_rng(seed))
-    row = row._replace(env=next(iter(environments)), test="sign-flip", **compared._asdict())
-    if metric.unit == "episodes":
-        p_value = logrank(*reached[0], how[1], np.random.default_rng(seed))
-        row = row._replace(test="log-rank", p_value=p_value)
-    return row
+        return rows
+    [environment], [(x, y)], [events] = environments, restricted, reached
+    compared = paired_comparisons(x, y, *how, np.random.default_rng(seed))
+    for place, (metric, found) in enumerate(zip(metrics, compared, strict=True)):
+        test = "sign-flip"
+        if metric.unit == "episodes":
+            mine, theirs = (values[:, place] for values in events)
+            p_value = logrank(mine, theirs, how[1], np.random.default_rng(seed))
+            test, found = "log-rank", found._replace(p_value=p_value)
+        rows[place] = rows[place]._replace(env=environment, test=test, **found._asdict())
+    return rows
 
 
-def _reached(runs: pd.DataFrame, metric: Metric, budget: int) -> np.ndarray:
-    """The metric's values of one variant, [seeds]; of episodes, np.inf if not in the budget."""
-    values = runs[metric.name].to_numpy(np.float64)
-    if metric.unit != "episodes":
-        return values
-    in_budget = (values <= budget) & (runs[metric.flag].to_numpy() == 0)
-    return np.where(in_budget, values, np.inf)
+def _reached(runs: pd.DataFrame, metrics: Sequence[Metric], budget: int) -> np.ndarray:
+    """The metrics of one variant, [seeds, metrics]; episodes beyond the budget are np.inf."""
+    values = runs[[metric.name for metric in metrics]].to_numpy(np.float64)
+    for place, metric in enumerate(metrics):
+        if metric.unit == "episodes":
+            never = (values[:, place] > budget) | (runs[metric.flag] == 1)
+            values[never, place] = np.inf
+    return values
 
 
 def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:

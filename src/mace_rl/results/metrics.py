@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -50,7 +51,7 @@ class LearningCurve:
     reference: float = math.nan  # `reference_return` and `solved_return` in this environment,
     solved: float = math.nan  # where the study has them
 
-    @property
+    @cached_property
     def learned(self) -> bool:
         """Whether the run ends better than random actions, by more than two standard errors.
 
@@ -58,6 +59,16 @@ class LearningCurve:
         """
         last = last_part(self.returns, self.settings.final_fraction)
         return bool(self.final - 2 * last.std() / math.sqrt(len(last)) > self.random_mean)
+
+    @cached_property
+    def average(self) -> np.ndarray:
+        """The `moving_average`, [E - window + 1]."""
+        return moving_average(self.returns, self.settings.moving_average)
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Its `slope`, [E - 2 · window + 1]."""
+        return slope(self.returns, self.settings.moving_average)
 
     def bar(self, goal: float) -> float:
         """The return threshold of the way from random actions to `goal`."""
@@ -140,10 +151,10 @@ def convergence_steps(curve: LearningCurve) -> Episode:
     Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
     """
     settings, window = curve.settings, curve.settings.moving_average
-    slopes = slope(curve.returns, window)
-    high = moving_average(curve.returns, window) >= curve.bar(curve.final)
+    high = curve.average >= curve.bar(curve.final)
     learnt = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
-    minimal = slopes <= settings.convergence_slope * np.maximum.accumulate(slopes)
+    steepest = np.maximum.accumulate(curve.slopes)
+    minimal = curve.slopes <= settings.convergence_slope * steepest
     return curve.first(learnt & minimal & curve.learned, 2 * window)
 
 
@@ -153,8 +164,7 @@ def convergence_steps_steepest(curve: LearningCurve) -> Episode:
     The steepest rise can be the recovery from a late collapse. Censored: the average never rises,
     is still rising at the end, the run has not `learned`, or E < 2 windows.
     """
-    window = curve.settings.moving_average
-    slopes = slope(curve.returns, window)
+    window, slopes = curve.settings.moving_average, curve.slopes
     if not (slopes > 0).any():
         return Episode(len(curve.returns), True)
     steepest = int(np.argmax(slopes))  # the first of equals
@@ -167,10 +177,9 @@ def convergence_steps_flattest(curve: LearningCurve) -> Episode:
     The most literal reading of the paper's sentence: it finds the flat start of a run that has yet
     to learn, or chance on the final plateau. Censored: the run has not `learned`, or E < 2 windows.
     """
-    window = curve.settings.moving_average
-    magnitude = np.abs(slope(curve.returns, window))
+    magnitude = np.abs(curve.slopes)
     flattest = magnitude == magnitude.min(initial=np.inf)
-    return curve.first(flattest & curve.learned, 2 * window)
+    return curve.first(flattest & curve.learned, 2 * curve.settings.moving_average)
 
 
 def convergence_steps_public_code(curve: LearningCurve) -> Episode:
@@ -211,8 +220,7 @@ def convergence_steps_range(curve: LearningCurve) -> Episode:
     run has not `learned`.
     """
     settings, gain = curve.settings, curve.final - curve.random_mean
-    average = moving_average(curve.returns, settings.moving_average)
-    near = np.abs(average - curve.final) <= settings.convergence_band * gain
+    near = np.abs(curve.average - curve.final) <= settings.convergence_band * gain
     settled = np.logical_and.accumulate(near[::-1])[::-1]
     return curve.first(settled & curve.learned, settings.moving_average)
 
@@ -364,8 +372,7 @@ def read_metrics(
 
 def _average_reaches(curve: LearningCurve, goal: float) -> Episode:
     """The first episode whose moving average is at the bar for `goal`."""
-    window = curve.settings.moving_average
-    return curve.first(moving_average(curve.returns, window) >= curve.bar(goal), window)
+    return curve.first(curve.average >= curve.bar(goal), curve.settings.moving_average)
 
 
 def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:

@@ -6,6 +6,7 @@ the line, because a damaged record would otherwise become a plausible number in 
 
 import csv
 import hashlib
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -150,7 +151,7 @@ def read_table(
             )
     try:
         frame = pd.read_csv(
-            path, dtype=dict(columns), keep_default_na=False, quoting=csv.QUOTE_NONE
+            io.BytesIO(content), dtype=dict(columns), keep_default_na=False, quoting=csv.QUOTE_NONE
         )
         numbers = [name for name, kind in columns.items() if kind is not str]
         whole = known or (

@@ -66,19 +66,32 @@ def paired_comparison(
     The sign-flip test asks whether each sign of x - y was as likely as the other. It is exact while
     2ⁿ ≤ `repetitions`, else of that many random sign patterns.
     """
-    difference = x - y
-    low, high = mean_interval(difference, confidence, repetitions, generator)
-    p_value = np.nan
-    if len(difference) > 1:
-        p_value = scipy.stats.permutation_test(
-            (difference,),
+    (compared,) = paired_comparisons(x[:, None], y[:, None], confidence, repetitions, generator)
+    return compared
+
+
+def paired_comparisons(
+    x: np.ndarray,
+    y: np.ndarray,
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> list[PairedComparison]:
+    """`paired_comparison` of each column of x and y, [seeds, metrics], with the same draws."""
+    differences = x - y
+    low, high = mean_interval(differences, confidence, repetitions, generator)
+    p_values = np.full(differences.shape[1], np.nan)
+    if len(differences) > 1:
+        p_values = scipy.stats.permutation_test(
+            (differences,),
             np.mean,
             permutation_type="samples",
             n_resamples=repetitions,
             rng=generator,
             vectorized=True,
         ).pvalue
-    return PairedComparison(float(np.mean(difference)), float(low), float(high), float(p_value))
+    columns = np.mean(differences, axis=0), low, high, p_values
+    return [PairedComparison(*map(float, row)) for row in zip(*columns, strict=True)]
 
 
 def stratified_comparison(
@@ -170,15 +183,34 @@ def probability_of_improvement(
     resampled independently. *Greater* is the improvement: pass the negative of a metric of which
     lower is better.
     """
-    means, resampled = [], np.zeros(repetitions)
+    columns = [(x[:, None], y[:, None]) for x, y in pairs]
+    (found,) = probabilities_of_improvement(columns, confidence, repetitions, generator)
+    return found
+
+
+def probabilities_of_improvement(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> list[tuple[float, float, float]]:
+    """`probability_of_improvement` of each column of x [n, metrics] and y [m, metrics].
+
+    The same draws serve every metric.
+    """
+    metrics = pairs[0][0].shape[1]
+    means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
     for x, y in pairs:
-        wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m]
-        drawn_x, drawn_y = (draws(runs, repetitions, generator) for runs in wins.shape)
-        one = np.nan if min(wins.shape) == 1 else np.sum((drawn_x @ wins) * drawn_y, axis=1)
-        means.append(wins.mean())
-        resampled += one / wins.size / len(pairs)
-    low, high = percentiles(resampled, confidence, min(min(x.size, y.size) for x, y in pairs))
-    return float(np.mean(means)), float(low), float(high)
+        wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m, metrics]
+        drawn_x, drawn_y = (draws(len(runs), repetitions, generator) for runs in (x, y))
+        means += wins.mean(axis=(0, 1)) / len(pairs)
+        for metric in range(metrics):
+            won = np.sum((drawn_x @ wins[:, :, metric]) * drawn_y, axis=1)
+            resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
+    low, high = percentiles(
+        resampled, confidence, min(len(runs) for both in pairs for runs in both)
+    )
+    return list(zip(*(bound.tolist() for bound in (means, low, high)), strict=True))
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
@@ -208,7 +240,7 @@ def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.nd
 
 
 def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
-    """The bounds [2, …] of a bootstrap interval from `estimates` [repetitions, …].
+    """The bounds [2, …] of a bootstrap interval from `estimates` [repetitions, …], used up by it.
 
     The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
     the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
@@ -219,4 +251,4 @@ def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndar
         return np.full((2, *estimates.shape[1:]), np.nan)
     wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
     tail = 100 * scipy.special.ndtr(-wider)
-    return np.percentile(estimates, [tail, 100 - tail], axis=0)
+    return np.percentile(estimates, [tail, 100 - tail], axis=0, overwrite_input=True)
