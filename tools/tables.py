@@ -10,22 +10,39 @@ page of one study is made, and not compared.
 """
 
 import argparse
+import gc
+import importlib
 import multiprocessing.connection
 import os
+import runpy
 import shutil
+import signal
+import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import gymnasium  # noqa: F401 - what workflow/rules/study.smk imports, imported once
 import snakemake.cli
+import snakemake.script
+from threadpoolctl import threadpool_limits
 
-import mace_rl.config.study  # noqa: F401 - likewise
 from mace_rl.config.reading import read_yaml
 from mace_rl.sources import digest
 from tools import archive
 
 ROOT = Path(__file__).resolve().parent.parent
+# What the workflow and its jobs import, or let be imported, which takes longer than most of the
+# jobs' work: imported once, before the processes of all of them are forked.
+SHARED = (
+    *("gymnasium", "smart_open", "nbformat", "rich.live", "pandas", "seaborn", "fontTools.subset"),
+    *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
+    *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
+    *(f"mace_rl.results.{name}" for name in ("claims", "comparisons", "pictures", "readings")),
+)
+fork = multiprocessing.get_context("fork")
+
 KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 PAGE = "report.html"
@@ -47,23 +64,56 @@ def make(name: str, study: dict[str, Any]) -> None:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     (folder / "runs").symlink_to("../runs", target_is_directory=True)
-    command = ["--cores", "1", "--quiet", "all", "--allowed-rules", *RULES]
+    command = ["--cores", "1", "--allowed-rules", *RULES]
     command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
     sys.argv = ["snakemake", *command]  # where profiles/default looks for --cores
-    snakemake.cli.main(command)
+    jobs, scripts = fork.Pipe()
+    fork.Process(target=run_scripts, args=(jobs, scripts)).start()
+    scripts.close()  # so that an end of that process does not leave this one waiting
+
+    def execute_script(_: object, script: str, edit: bool = False) -> None:
+        jobs.send(script)
+        if status := jobs.recv():
+            raise subprocess.CalledProcessError(status, script)
+
+    snakemake.script.PythonScript.execute_script = execute_script
+    try:
+        snakemake.cli.main(command)
+    finally:
+        jobs.send(None)
+
+
+def run_scripts(jobs: Connection, scripts: Connection) -> None:
+    """Run each script that comes in a process forked from this one, and send its exit status.
+
+    Not forked from Snakemake's own process, which has threads by then.
+    """
+    jobs.close()  # so that the end of Snakemake is the end of this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the scripts end, which Snakemake is to hear
+    for script in iter(scripts.recv, None):
+        process = fork.Process(
+            target=runpy.run_path, args=(script,), kwargs={"run_name": "__main__"}
+        )
+        process.start()
+        process.join()
+        scripts.send(process.exitcode)
 
 
 def make_all(studies: dict[str, Any]) -> None:
     """Make the outputs of every study, as many studies at once as there are cores.
 
-    Each in a process forked from this one, which has done what Snakemake begins with every time:
-    its imports, its plugins, and parsing what digests are of.
+    Each in a process forked from this one, which has done what all of them begin with: imports,
+    Snakemake's plugins, and parsing what digests are of.
     """
     snakemake.cli.get_argument_parser()
     digest(*Path("workflow/scripts").glob("*.py"))
-    fork = multiprocessing.get_context("fork")
+    # One thread for each job, as where Snakemake itself starts it: of libraries that are loaded and
+    # of those that will be.
+    threadpool_limits(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    gc.freeze()  # or each process would go through, and so copy, what all of them share
     waiting = [(name, fork.Process(target=make, args=(name, studies[name]))) for name in studies]
     running: dict[Any, tuple[str, Any]] = {}  # by what is ready when the process ends
     while waiting or running:
@@ -111,7 +161,11 @@ def main() -> None:
     if only and only not in studies:
         sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
     shutil.rmtree(MADE, ignore_errors=True)
-    runs = archive.unpack(KEPT, MADE)
+    with ThreadPoolExecutor(1) as beside:
+        unpacked = beside.submit(archive.unpack, KEPT, MADE)
+        for module in SHARED:
+            importlib.import_module(module)
+        runs = unpacked.result()
     if only:
         make_all({only: {**studies[only], "outputs": [PAGE]}})
         print(MADE / only / PAGE)
