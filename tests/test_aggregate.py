@@ -1,33 +1,16 @@
 """Scores over all environments, against independent computations."""
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy.stats
 
 from mace_rl.config.study import Study
 from mace_rl.results import aggregate as a
-
-
-def table(seeds: dict[str, int]) -> pd.DataFrame:
-    draws = np.random.default_rng(3)
-    rows = [
-        {"env": env, "variant": variant, "seed": seed}
-        for env, count in seeds.items()
-        for variant in ("ppo", "mace_full")
-        for seed in range(count)
-    ]
-    frame = pd.DataFrame(rows)
-    for metric in a.SCORED:
-        frame[metric] = draws.normal(300, 50, len(frame)).round(1)
-    return frame
-
-
-SEEDS = {"CartPole-v1": 12, "HopperBulletEnv-v0": 10}
+from tests.invented import SEEDS, table_for_scores
 
 
 def test_scores_are_between_random_and_the_best_run(study: Study) -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     found = a.scores(frame, study.metrics).set_index(["env", "metric", "variant", "seed"])["score"]
     best = frame.loc[frame["env"] == "CartPole-v1", "final_return"].max()
     for _, row in frame[frame["env"] == "CartPole-v1"].iterrows():
@@ -38,7 +21,7 @@ def test_scores_are_between_random_and_the_best_run(study: Study) -> None:
 
 
 def test_an_environment_that_nobody_is_better_in_than_random_counts_as_zero(study: Study) -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     for metric in a.SCORED:
         frame.loc[frame["env"] == "HopperBulletEnv-v0", metric] = -3.0
     found = a.scores(frame, study.metrics)
@@ -57,7 +40,7 @@ def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
 
 
 def test_aggregate_against_a_loop(study: Study) -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])
     score = a.scores(frame, study.metrics)
     runs = score[(score["metric"] == "final_return") & (score["variant"] == "ppo")]
@@ -77,6 +60,6 @@ def test_aggregate_against_a_loop(study: Study) -> None:
 
 
 def test_one_seed_allows_no_interval(study: Study) -> None:
-    found = a.aggregate(table({"CartPole-v1": 1}), study.metrics)
+    found = a.aggregate(table_for_scores({"CartPole-v1": 1}), study.metrics)
     assert found["mean"].notna().all()
     assert found[["mean_low", "mean_high", "iqm_low", "iqm_high"]].isna().all(axis=None)

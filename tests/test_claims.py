@@ -1,6 +1,5 @@
 """The verdicts on the paper's claims, from tables in which the truth is known."""
 
-import itertools
 import json
 import shutil
 import subprocess
@@ -14,40 +13,11 @@ import scipy.stats
 
 from mace_rl.config.study import Study
 from mace_rl.results import claims
-from mace_rl.results.claims import CLAIMS, CORRELATION, LITERAL, ROBUST
+from mace_rl.results.claims import CLAIMS, LITERAL, ROBUST
 from mace_rl.results.statistics import paired_comparison, stratified_comparison
+from tests.invented import table_for_claims
 
 ROOT = Path(__file__).parents[1]
-EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
-LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
-
-
-def table(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:
-    """metrics.csv in which a variant is better by `advantage` of everything, in all it does."""
-    draws = np.random.default_rng(1)
-    rows = []
-    for env, variant, seed in itertools.product(
-        EPISODES, ("ppo", "mace_fixed", "mace_full"), range(seeds)
-    ):
-        row: dict[str, object] = {"env": env, "variant": variant, "seed": seed}
-        row["episodes"] = EPISODES[env]
-        for name in (
-            "sample_efficiency",
-            "sample_efficiency_common",
-            "convergence_steps",
-            "convergence_steps_public_code",
-        ):
-            share = 0.5 - advantage[variant] + noise * draws.normal()
-            row[name] = round(share * EPISODES[env])
-        for name in ("final_return", "area_under_curve", "early_return"):
-            share = 0.5 + advantage[variant] + noise * draws.normal()
-            row[name] = share * LEARNED[env]
-            if env == "Acrobot-v1":
-                row[name] = -500 + share * 415
-        if variant == "mace_full":
-            row[CORRELATION] = advantage[variant] + noise * draws.normal()
-        rows.append(row)
-    return pd.DataFrame(rows)
 
 
 def verdicts(frame: pd.DataFrame, study: Study) -> dict[str, tuple[str, str]]:
@@ -60,13 +30,13 @@ def verdicts(frame: pd.DataFrame, study: Study) -> dict[str, tuple[str, str]]:
 
 
 def test_what_is_plainly_so_is_reproduced(study: Study) -> None:
-    frame = table(20, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
+    frame = table_for_claims(20, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
     expected = dict.fromkeys((claim.name for claim in CLAIMS), ("reproduced",) * 2)
     assert verdicts(frame, study) == expected | {"C6": ("contradicted",) * 2}
 
 
 def test_fixed_first_is_what_one_claim_wants(study: Study) -> None:
-    frame = table(20, {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}, noise=0.02)
+    frame = table_for_claims(20, {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}, noise=0.02)
     found = verdicts(frame, study)
     assert found["C6"] == ("reproduced", "reproduced")
     assert found["C9"] == ("reproduced", "reproduced")  # asks nothing of the others
@@ -77,15 +47,15 @@ def test_no_difference_worth_mentioning_contradicts_and_too_few_seeds_decide_not
     study: Study,
 ) -> None:
     equal = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
-    many = verdicts(table(20, equal, noise=0.02), study)
+    many = verdicts(table_for_claims(20, equal, noise=0.02), study)
     assert set(many.values()) == {("contradicted", "contradicted")}
     plain = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
-    for few in (table(9, equal, noise=0.0), table(9, plain, noise=0.02)):
+    for few in (table_for_claims(9, equal, noise=0.0), table_for_claims(9, plain, noise=0.02)):
         assert set(verdicts(few, study).values()) == {("inconclusive", "inconclusive")}
 
 
 def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
-    frame = table(12, {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}, noise=0.1)
+    frame = table_for_claims(12, {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}, noise=0.1)
     part = claims.ledger(frame, study.metrics)[0][ROBUST]["parts"][0]
     assert (part["variant"], part["baseline"]) == ("mace_full", "ppo")
     runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])[
@@ -106,7 +76,7 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
 
 
 def test_one_seed_has_estimates_but_no_tests_and_decides_nothing(study: Study) -> None:
-    frame = table(1, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
+    frame = table_for_claims(1, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
     assert set(verdicts(frame, study).values()) == {("inconclusive", "inconclusive")}
     records = json.loads(claims.as_json(claims.ledger(frame, study.metrics), cost={}))["claims"]
     part = records[0][ROBUST]["parts"][0]
@@ -148,7 +118,7 @@ def test_verdict(outcomes: list[str], expected: str) -> None:
 
 
 def test_seeds_have_to_be_the_same(study: Study) -> None:
-    frame = table(5, dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0), noise=0.1)
+    frame = table_for_claims(5, dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0), noise=0.1)
     frame = frame[~((frame["variant"] == "ppo") & (frame["seed"] == 3))]
     with pytest.raises(ValueError, match="do not have the same seeds"):
         claims.ledger(frame, study.metrics)

@@ -9,26 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.config.section import check
 from mace_rl.results import metrics as m
+from tests.invented import CONFIG, noisy
 
 ROOT = Path(__file__).parents[1]
-SETTINGS = {
-    "final_fraction": 0.1,
-    "threshold": 0.75,
-    "moving_average": 50,
-    "convergence_slope": 0.1,
-    "convergence_band": 0.1,
-    "confidence": 0.95,
-    "bootstrap_repetitions": 1000,
-    "bootstrap_seed": 0,
-    "comparisons": [],
-    "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
-    "reference_return": {"CartPole-v1": 400.0, "Acrobot-v1": -200.0},
-    "solved_return": {"CartPole-v1": 475.0, "Acrobot-v1": -100.0},
-}
-CONFIG = check(MetricsConfig, SETTINGS, "test")
 
 
 def ramp(flat_before, rise, flat_after):
@@ -45,22 +29,10 @@ def curve(returns, final=None, random=-1e9, goals=(), **settings):
     return m.LearningCurve(returns, final, random, changed, *goals)
 
 
-def noisy(seed, episodes=400):
-    """A learning curve with noise, rounded so that equal values occur."""
-    generator = np.random.default_rng(seed)
-    level = 100 / (1 + np.exp(-(np.arange(episodes) - generator.integers(50, 300)) / 20))
-    return np.round(level + generator.normal(size=episodes) * 10)
-
-
 def averages(returns, window):
     """Moving averages by episode number (from 1), from pandas."""
     rolling = pd.Series(returns).rolling(window).mean()
     return {t + 1: value for t, value in enumerate(rolling) if not np.isnan(value)}
-
-
-def frame(returns, length=1):
-    episodes = np.arange(1, len(returns) + 1)
-    return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
 
 
 def test_final_return_by_hand():

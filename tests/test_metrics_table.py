@@ -12,8 +12,9 @@ import pytest
 from mace_rl.config.results import GOALS, MetricsConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.results import metrics as m
+from mace_rl.results import metrics_table as t
 from mace_rl.results.records import RecordError
-from tests.test_metrics import CONFIG, SETTINGS, frame, noisy
+from tests.invented import CONFIG, SETTINGS, frame, noisy
 
 ROOT = Path(__file__).parents[1]
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
@@ -56,12 +57,12 @@ def runs():
 
 
 def table(**changed):
-    return m.metrics_table(**{"runs": runs(), "wanted": WANTED, "settings": CONFIG} | changed)
+    return t.metrics_table(**{"runs": runs(), "wanted": WANTED, "settings": CONFIG} | changed)
 
 
 def test_a_row_holds_each_metric_under_its_name():
     returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
-    row = m.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    row = t.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
     assert row == ROW
     assert list(row) == COLUMNS
 
@@ -122,7 +123,7 @@ def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
     spoil(lines)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordError, match=named) as refusal:
-        m.read_metrics(path, WANTED, CONFIG)
+        t.read_metrics(path, WANTED, CONFIG)
     assert str(path) in str(refusal.value)
 
 
@@ -157,10 +158,10 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
         first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
         assert tuple(row) == (first or 400, min(returns), first is None)
     result.to_csv(tmp_path / "metrics.csv", index=False)
-    read = m.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
+    read = t.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
     pd.testing.assert_frame_equal(read, result, check_exact=True)
     with pytest.raises(RecordError, match="line 1: the column 'positive'"):
-        m.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
+        t.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
 
 
 @pytest.mark.parametrize(

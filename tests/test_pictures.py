@@ -14,7 +14,7 @@ from mace_rl.report.panels import svg
 from mace_rl.results import pictures
 from mace_rl.results.aggregate import SCORED, scores
 from mace_rl.results.figures import figure_as_svg, save_figure
-from tests.test_aggregate import SEEDS, table
+from tests.invented import SEEDS, table_for_scores
 
 NAMES = {"ppo": "PPO", "mace_full": "Full"}
 COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
@@ -37,7 +37,7 @@ def test_a_panel_of_the_page_says_and_shows_what_the_figure_does() -> None:
 
 
 def test_a_profile_is_the_share_of_runs_that_are_at_least_so_good(study: Study) -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     curves, every = pictures.profiles(frame, study.metrics), scores(frame, study.metrics)
     for (metric, variant), curve in curves.groupby(["metric", "variant"]):
         own = every[(every["metric"] == metric) & (every["variant"] == variant)]["score"]
@@ -49,7 +49,7 @@ def test_a_profile_is_the_share_of_runs_that_are_at_least_so_good(study: Study) 
 
 
 def test_the_band_of_a_profile_is_the_bootstrap_of_its_share(study: Study) -> None:
-    frame = table({"CartPole-v1": 12})
+    frame = table_for_scores({"CartPole-v1": 12})
     curves, every = pictures.profiles(frame, study.metrics), scores(frame, study.metrics)
     one = curves[(curves["metric"] == "final_return") & (curves["variant"] == "ppo")]
     own = every[(every["metric"] == "final_return") & (every["variant"] == "ppo")]["score"]
@@ -61,7 +61,7 @@ def test_the_band_of_a_profile_is_the_bootstrap_of_its_share(study: Study) -> No
 
 
 def test_every_run_is_a_dot_of_its_variants_colour() -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     figure = pictures.draw_every_seed(frame, NAMES, COLOURS)
     panels = {axes.get_title(): axes for axes in figure.axes}
     assert len(panels) == len(SEEDS) * len(SCORED)
@@ -74,7 +74,7 @@ def test_every_run_is_a_dot_of_its_variants_colour() -> None:
 
 
 def test_the_regret_shows_constants_as_a_line_and_others_beside_it(study: Study) -> None:
-    frame = table({"CartPole-v1": 5})
+    frame = table_for_scores({"CartPole-v1": 5})
     constant = frame[frame["variant"] == "ppo"].assign(variant="beta_1")
     frame = pd.concat([frame, constant.assign(area_under_curve=100.0)], ignore_index=True)
     regret = RegretConfig(variant="mace_full", constants=["ppo", "beta_1"])
@@ -90,7 +90,7 @@ def test_the_regret_shows_constants_as_a_line_and_others_beside_it(study: Study)
 
 
 def test_a_picture_is_the_same_file_again(study: Study, tmp_path) -> None:
-    frame = table(SEEDS)
+    frame = table_for_scores(SEEDS)
     curves = pictures.profiles(frame, study.metrics)
     files = [tmp_path / name for name in ("a.png", "b.png", "a.pdf", "b.pdf")]
     for path in files:

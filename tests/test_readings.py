@@ -6,7 +6,7 @@ import pytest
 
 from mace_rl.config.study import Study
 from mace_rl.results import readings as r
-from mace_rl.results.metrics import metrics_table
+from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_TABLE1
 
 EPISODES = 400

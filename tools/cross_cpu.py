@@ -136,7 +136,7 @@ def tabulate(folder: Path) -> None:
     from mace_rl.cli import CONFIG
     from mace_rl.config.study import read_study
     from mace_rl.results import figures, tables
-    from mace_rl.results.metrics import metrics_table
+    from mace_rl.results.metrics_table import metrics_table
     from mace_rl.results.records import read_episodes
 
     study = read_study([CONFIG, CONFIG.parent / "config" / "reference.yaml"])

@@ -6,7 +6,7 @@ with job("aggregate", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.results.aggregate import aggregate
-    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.metrics_table import read_metrics
 
     params = snakemake.params
     settings = MetricsConfig.model_validate(params.settings)

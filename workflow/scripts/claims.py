@@ -8,7 +8,7 @@ with job("claims", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.results import claims
-    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.metrics_table import read_metrics
     from mace_rl.results.paper import FULL
     from mace_rl.runs.finished import read_runs
     from mace_rl.runs.provenance import read_record

@@ -5,7 +5,7 @@ from job import job
 with job("metrics", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.metrics import metrics_table
+    from mace_rl.results.metrics_table import metrics_table
     from mace_rl.runs.finished import read_runs
 
     params = snakemake.params

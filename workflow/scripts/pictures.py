@@ -9,7 +9,7 @@ with job("pictures", snakemake.log[0]):
     from mace_rl.files import write_atomically
     from mace_rl.results import pictures
     from mace_rl.results.figures import save_figure
-    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.metrics_table import read_metrics
 
     params = snakemake.params
     settings = MetricsConfig.model_validate(params.settings)

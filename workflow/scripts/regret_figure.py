@@ -5,7 +5,7 @@ from job import job
 with job("the figure of the regret", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.results.figures import save_figure
-    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.metrics_table import read_metrics
     from mace_rl.results.pictures import draw_regret
 
     params = snakemake.params

@@ -6,7 +6,7 @@ with job("Table 1", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.results import tables
-    from mace_rl.results.metrics import read_metrics
+    from mace_rl.results.metrics_table import read_metrics
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)

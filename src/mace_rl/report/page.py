@@ -22,7 +22,8 @@ from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, digits_of
 from mace_rl.results.figures import quantity
-from mace_rl.results.metrics import all_metrics, read_metrics
+from mace_rl.results.metrics import all_metrics
+from mace_rl.results.metrics_table import read_metrics
 from mace_rl.results.paper import PAPER_METRICS
 from mace_rl.results.pictures import draw_every_seed, draw_profiles, draw_regret
 from mace_rl.results.readings import draw_readings, in_order, ranked, title

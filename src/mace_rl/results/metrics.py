@@ -7,24 +7,17 @@ censored, never dropped; E is then a lower bound.
 """
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from numbers import Real
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mace_rl.config.plugins import load
 from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.results.records import RecordError, RunKey, read_table
-
-if TYPE_CHECKING:  # pandas is imported where a frame is built: planning the workflow does without
-    import pandas as pd
 
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
@@ -309,67 +302,6 @@ def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
 
 
-def metrics_of_run(
-    frame: "pd.DataFrame", run: RunKey, settings: MetricsConfig
-) -> dict[str, str | int | float]:
-    """The row of metrics.csv of one run, from its records (`read_episodes`)."""
-    environment, variant, seed = run
-    returns = frame["extrinsic_return"].to_numpy()
-    final = final_return(returns, settings.final_fraction)
-    random = settings.random_return_in(environment)
-    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
-    curve = LearningCurve(returns, final, random, settings, *goals)
-    row: dict[str, str | int | float]
-    row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(returns)}
-    row["env_steps"] = int(frame["env_steps"].iloc[-1])
-    metrics = all_metrics(settings)
-    for metric in metrics:
-        value = metric.function(curve)
-        if metric.unit == "episodes" and isinstance(value, Episode):
-            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
-        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
-            row[metric.name] = float(value)
-        else:
-            kind = "an Episode" if metric.unit == "episodes" else "a finite number"
-            raise ConfigError(f"{metric.name} of {_name(run)} is {value!r}, but should be {kind}")
-    return {name: row[name] for name in metrics_columns(metrics)}
-
-
-def metrics_table(
-    runs: Mapping[RunKey, "pd.DataFrame"], wanted: Sequence[RunKey], settings: MetricsConfig
-) -> "pd.DataFrame":
-    """One row of `metrics_columns` per run, in the order of `wanted`.
-
-    Raises `RecordError` unless `runs` holds exactly these, and `ConfigError` for metrics that
-    cannot be.
-    """
-    import pandas as pd
-
-    _check_runs("the records", runs, wanted)
-    table = pd.DataFrame([metrics_of_run(runs[run], run, settings) for run in wanted])
-    _check_attained("the table of metrics", table, all_metrics(settings))
-    _check_budgets("the records", table)
-    return table
-
-
-def read_metrics(
-    path: str | Path, wanted: Sequence[RunKey], settings: MetricsConfig
-) -> "pd.DataFrame":
-    """Read metrics.csv; `RecordError` unless it is `metrics_table` of exactly the `wanted` runs."""
-    metrics = all_metrics(settings)
-    table = read_table(path, metrics_columns(metrics))
-    found = list(zip(table["env"], table["variant"], table["seed"].tolist(), strict=True))
-    _check_runs(str(path), found, wanted)
-    for line, (run, right) in enumerate(zip(found, wanted, strict=True), start=2):
-        if run != right:
-            raise RecordError(
-                f"{path}: line {line}: {_name(run)} stands where {_name(right)} belongs"
-            )
-    _check_attained(str(path), table, metrics)
-    _check_budgets(str(path), table)
-    return table
-
-
 def _average_reaches(curve: LearningCurve, goal: float) -> Episode:
     """The first episode whose moving average is at the bar for `goal`."""
     return curve.first(curve.average >= curve.bar(goal), curve.settings.moving_average)
@@ -380,43 +312,3 @@ def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:
     if len(values) < window:
         return np.empty(0)
     return np.lib.stride_tricks.sliding_window_view(values, window).sum(axis=-1)
-
-
-def _check_runs(origin: str, found: Iterable[RunKey], wanted: Sequence[RunKey]) -> None:
-    """Refuse a set of runs that is not exactly the configured one."""
-    counts = Counter(iter(found))
-    for run in wanted:
-        if counts[run] != 1:
-            problem = "stands more than once in" if counts[run] else "is missing from"
-            raise RecordError(f"{_name(run)} {problem} {origin}")
-    for run in counts.keys() - set(wanted):
-        raise RecordError(f"{_name(run)} in {origin} is not in the configuration")
-
-
-def _check_budgets(origin: str, table: "pd.DataFrame") -> None:
-    """Refuse seeds of different lengths, which must not be averaged."""
-    for (environment, variant), group in table.groupby(["env", "variant"], sort=False):
-        if group["episodes"].nunique() != 1:
-            counts = sorted(set(group["episodes"]))
-            raise RecordError(
-                f"{origin}: the seeds of {environment}, {variant} have different numbers of"
-                f" episodes: {counts}"
-            )
-
-
-def _check_attained(origin: str, table: "pd.DataFrame", metrics: Sequence[Metric]) -> None:
-    """Refuse episodes outside of training, and flags that contradict them."""
-    for metric in (metric for metric in metrics if metric.unit == "episodes"):
-        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
-        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
-        if not right.all():
-            row = int(np.argmin(right))
-            raise RecordError(
-                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
-                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
-            )
-
-
-def _name(run: RunKey) -> str:
-    environment, variant, seed = run
-    return f"the run {environment}, {variant}, seed {seed}"

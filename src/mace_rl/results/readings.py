@@ -13,7 +13,8 @@ import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.figures import LEGEND_HEIGHT, WIDTH, style
-from mace_rl.results.metrics import Metric, all_metrics, metrics_table
+from mace_rl.results.metrics import Metric, all_metrics
+from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
 from mace_rl.results.records import RunKey
 from mace_rl.results.statistics import logrank, mean_interval

@@ -1,0 +1,87 @@
+"""What tests of the results share: settings, and records and tables that no run has given."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.config.section import check
+from mace_rl.results.aggregate import SCORED
+from mace_rl.results.claims import CORRELATION
+
+SETTINGS = {
+    "final_fraction": 0.1,
+    "threshold": 0.75,
+    "moving_average": 50,
+    "convergence_slope": 0.1,
+    "convergence_band": 0.1,
+    "confidence": 0.95,
+    "bootstrap_repetitions": 1000,
+    "bootstrap_seed": 0,
+    "comparisons": [],
+    "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
+    "reference_return": {"CartPole-v1": 400.0, "Acrobot-v1": -200.0},
+    "solved_return": {"CartPole-v1": 475.0, "Acrobot-v1": -100.0},
+}
+CONFIG = check(MetricsConfig, SETTINGS, "test")
+
+EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
+LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
+SEEDS = {"CartPole-v1": 12, "HopperBulletEnv-v0": 10}  # of `table_for_scores`
+
+
+def noisy(seed: int, episodes: int = 400) -> np.ndarray:
+    """A learning curve with noise, rounded so that equal values occur."""
+    generator = np.random.default_rng(seed)
+    level = 100 / (1 + np.exp(-(np.arange(episodes) - generator.integers(50, 300)) / 20))
+    return np.round(level + generator.normal(size=episodes) * 10)
+
+
+def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:
+    """The records of a run with these returns, every episode of this length."""
+    episodes = np.arange(1, len(returns) + 1)
+    return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
+
+
+def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:
+    """metrics.csv in which a variant is better by `advantage` of everything, in all it does."""
+    draws = np.random.default_rng(1)
+    rows = []
+    for env, variant, seed in itertools.product(
+        EPISODES, ("ppo", "mace_fixed", "mace_full"), range(seeds)
+    ):
+        row: dict[str, object] = {"env": env, "variant": variant, "seed": seed}
+        row["episodes"] = EPISODES[env]
+        for name in (
+            "sample_efficiency",
+            "sample_efficiency_common",
+            "convergence_steps",
+            "convergence_steps_public_code",
+        ):
+            share = 0.5 - advantage[variant] + noise * draws.normal()
+            row[name] = round(share * EPISODES[env])
+        for name in ("final_return", "area_under_curve", "early_return"):
+            share = 0.5 + advantage[variant] + noise * draws.normal()
+            row[name] = share * LEARNED[env]
+            if env == "Acrobot-v1":
+                row[name] = -500 + share * 415
+        if variant == "mace_full":
+            row[CORRELATION] = advantage[variant] + noise * draws.normal()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def table_for_scores(seeds: dict[str, int]) -> pd.DataFrame:
+    """metrics.csv of two variants that are alike, with what scores are of."""
+    draws = np.random.default_rng(3)
+    rows = [
+        {"env": env, "variant": variant, "seed": seed}
+        for env, count in seeds.items()
+        for variant in ("ppo", "mace_full")
+        for seed in range(count)
+    ]
+    frame = pd.DataFrame(rows)
+    for metric in SCORED:
+        frame[metric] = draws.normal(300, 50, len(frame)).round(1)
+    return frame
