@@ -11,7 +11,8 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from tests.invented import table_for_claims
-from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed, show
+from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed
+from tools.shown import results, runs
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,12 +82,12 @@ def test_means_and_solved_seeds(tmp_path: Path) -> None:
         for seed in range(4)
     ]
     folder = write(pd.DataFrame(rows), tmp_path)
-    mean = show.means(folder, "final_return")[2]
+    mean = results.means(folder, "final_return")[2]
     assert mean.startswith("| A-v0 | ppo | 4 | 2 (")
     low, high = map(float, re.findall(r"\((\S+) to (\S+)\)", mean.replace("−", "-"))[0])
     half = 3.182446 * np.std([0.5, 1.5, 2.5, 3.5], ddof=1) / 2  # t with 3 degrees of freedom
     assert (low, high) == (pytest.approx(2 - half, abs=1e-3), pytest.approx(2 + half, abs=1e-3))
-    assert show.solved(folder)[2] == "| ppo | 3 of 4; −1.5 | 3 of 4; −1.5 |"
+    assert results.solved(folder)[2] == "| ppo | 3 of 4; −1.5 | 3 of 4; −1.5 |"
 
 
 def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
@@ -94,12 +95,12 @@ def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
     text = claims.as_json(claims.ledger(frame, settings), {"runs": 1})
     (tmp_path / "claims.json").write_text(text, encoding="utf-8")
-    (line,) = show.headline(tmp_path)
+    (line,) = results.headline(tmp_path)
     assert "10 claims: 9 reproduced, 1 contradicted, 0 inconclusive" in line
     share = float(re.findall(r"by (\S+) % of the way", line)[0])
     assert share == pytest.approx(30, abs=3)
-    assert len(show.ledger(tmp_path)) == 12
-    assert sum("| holds |" in line for line in show.parts(tmp_path)) == 22
+    assert len(results.ledger(tmp_path)) == 12
+    assert sum("| holds |" in line for line in results.parts(tmp_path)) == 22
 
 
 def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
@@ -116,14 +117,14 @@ def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
             for seed, area in enumerate(values)
         ]
         write(pd.DataFrame(rows), tmp_path / name)
-    line = show.together(tmp_path / "first", "second", "full", "other")[-1]
+    line = results.together(tmp_path / "first", "second", "full", "other")[-1]
     assert line.startswith("| full over other | 2 | 2 to 3 | 0.75 (")
     for words, reason in (
         (("full", "nobody"), "'full' and 'nobody'"),
         (("full",), "wants a variant"),
     ):
         with pytest.raises(SystemExit, match=reason):
-            show.together(tmp_path / "first", "second", *words)
+            results.together(tmp_path / "first", "second", *words)
 
 
 def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
@@ -131,7 +132,7 @@ def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
         {"env": "A-v0", "variant": "ppo", "final_return": final, "area_under_curve": 2 * final}
         for final in (3.0, 1.0, 5.0)
     ]
-    (line,) = show.finals(write(pd.DataFrame(rows), tmp_path))[2:]
+    (line,) = results.finals(write(pd.DataFrame(rows), tmp_path))[2:]
     assert line == "| ppo | 3 [1] / 6 |"
 
 
@@ -147,7 +148,7 @@ def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
     measured = capsys.readouterr().out
     assert measured.splitlines() == ["env,variant,seeds,first,last", "A-v0,beta_1,2,0.0100,0.3700"]
     (tmp_path / "bonus_share.csv").write_text(measured + "B-v0,beta_2,2,0.5,0.25\n")
-    assert show.shares(tmp_path) == [
+    assert runs.shares(tmp_path) == [
         "| | seeds | beta_1 | beta_2 |",
         "|---|---|---|---|",
         "| A-v0 | 2 | 0.01 / 0.37 |  |",
@@ -157,7 +158,7 @@ def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
         bonus_share.main(tmp_path, ["beta_2"])
 
 
-def test_the_last_betas_are_in_order_of_size(tmp_path: Path) -> None:
+def test_the_betas_of_each_seed_are_in_order_of_size(tmp_path: Path) -> None:
     """20 episodes: those of the last two count."""
     content = {}
     for seed, last in enumerate((0.5, 0.2)):
@@ -165,7 +166,8 @@ def test_the_last_betas_are_in_order_of_size(tmp_path: Path) -> None:
         content[f"seed{seed}/episodes.csv"] = frame.to_csv(index=False).encode()
         content[f"seed{seed}/run.json"] = b"{}"
     archive.write(tmp_path / "A-v0" / "mace_full.tar.xz", content)
-    assert show.betas(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.25, 0.55 |"]
+    assert runs.betas(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.25, 0.55 |"]
+    assert runs.lowest(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.20, 0.50 |"]
 
 
 def test_what_is_measured_of_the_credit_of_beta(tmp_path: Path) -> None:
@@ -179,5 +181,5 @@ def test_what_is_measured_of_the_credit_of_beta(tmp_path: Path) -> None:
     assert len(table) == 3 + 6 * 3
     cosines = table[table["measure"] == "cosine, as Adam steps"]["value"]
     assert ((cosines > 0.2) & (cosines <= 1)).all()
-    assert "| A-v0, 7 | 2 | −0.25 / 0.00 / 0.50 |  |" in show.signals(tmp_path)[2]
-    assert show.signals(tmp_path)[3].startswith("| DeepSea10-v0, 500 | 1 | ")
+    assert "| A-v0, 7 | 2 | −0.25 / 0.00 / 0.50 |  |" in runs.signals(tmp_path)[2]
+    assert runs.signals(tmp_path)[3].startswith("| DeepSea10-v0, 500 | 1 | ")

@@ -138,8 +138,8 @@ def convergence_steps(curve: LearningCurve) -> Episode:
     """The point where the slope of the moving average becomes minimal (paper).
 
     Our reading: the first episode, once the average has come threshold of the way from random to
-    final, at which its slope is down to `convergence_slope` of the steepest so far. Of the readings
-    that tools.convergence_simulation compares it varies least between seeds.
+    final, at which its slope is down to `convergence_slope` of the steepest so far. It is steady
+    from seed to seed and sees a delay (tools.convergence_simulation; docs/metrics.md).
 
     Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
     """
