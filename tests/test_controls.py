@@ -200,7 +200,7 @@ def test_wrong_settings_get_one_line(run_config, beta, message):
 
 def test_the_study_of_controls_compares_the_learnt_beta_with_each():
     study = read_study([ROOT / "config.yaml", ROOT / "config" / "controls.yaml"])
-    assert len(set(study.colours.values())) == len(set(study.labels.values())) == 11
+    assert len(set(study.colours.values())) == len(set(study.labels.values())) == 13
     others = [variant for variant in study.variants if variant != "mace_full"]
     assert sorted(study.metrics.comparisons) == sorted(["mace_full", other] for other in others)
     for variant in others:
