@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import scipy.stats
+from invented import SEEDS, table_for_scores
 
 from mace_rl.config.study import Study
 from mace_rl.results import aggregate as a
-from tests.invented import SEEDS, table_for_scores
 
 
 def test_scores_are_between_random_and_the_best_run(study: Study) -> None:

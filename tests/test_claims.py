@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
+from invented import table_for_claims
 
 from mace_rl.config.study import Study
 from mace_rl.results import claims
 from mace_rl.results.claims import CLAIMS, LITERAL, ROBUST
 from mace_rl.results.statistics import paired_comparison, stratified_comparison
-from tests.invented import table_for_claims
 
 ROOT = Path(__file__).parents[1]
 

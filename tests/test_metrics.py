@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from invented import CONFIG, noisy
 
 from mace_rl.results import metrics as m
-from tests.invented import CONFIG, noisy
 
 ROOT = Path(__file__).parents[1]
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from invented import CONFIG, SETTINGS, frame, noisy
 
 from mace_rl.config.results import GOALS, MetricsConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.results import metrics as m
 from mace_rl.results import metrics_table as t
 from mace_rl.results.records import RecordError
-from tests.invented import CONFIG, SETTINGS, frame, noisy
 
 ROOT = Path(__file__).parents[1]
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from invented import table_for_claims
 
 from mace_rl.config.study import Study
 from mace_rl.results import claims
-from tests.invented import table_for_claims
 from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed
 from tools.shown import results, runs
 

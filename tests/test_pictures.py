@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from invented import SEEDS, table_for_scores
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -14,7 +15,6 @@ from mace_rl.report.panels import svg
 from mace_rl.results import pictures
 from mace_rl.results.aggregate import SCORED, scores
 from mace_rl.results.figures import figure_as_svg, save_figure
-from tests.invented import SEEDS, table_for_scores
 
 NAMES = {"ppo": "PPO", "mace_full": "Full"}
 COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}

@@ -7,7 +7,7 @@ from types import ModuleType
 import pytest
 from shared import Bonanza
 
-from tools import convergence_simulation, random_return, show
+from tools import convergence_simulation, random_return, show, tables
 
 
 def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
@@ -88,3 +88,25 @@ def test_a_folder_that_gives_no_column(
     said = message(monkeypatch, convergence_simulation, str(folder))
     assert said.startswith("convergence_simulation: ") and expected in said
     assert files == ["Foo-v0/ppo/seed0/episodes.csv"] or str(folder) in said
+
+
+def test_tables_runs_each_script_in_a_process_of_its_own_and_hears_how_it_ended(
+    tmp_path: Path,
+) -> None:
+    script, trace = tmp_path / "script.py", tmp_path / "trace"
+    jobs, scripts = tables.fork.Pipe()
+    server = tables.fork.Process(target=tables.run_scripts, args=(jobs, scripts))
+    server.start()
+    scripts.close()
+    note = f"import os\nopen({str(trace)!r}, 'a').write(f'{{__name__}} {{os.getpid()}}\\n')\n"
+    found = []
+    for end in ("", "raise SystemExit(3)", "raise ValueError", "os.kill(os.getpid(), 9)"):
+        script.write_text(note + end, encoding="utf-8")
+        jobs.send(str(script))
+        found.append(jobs.recv())
+    assert found == [0, 3, 1, -9]
+    names, processes = zip(*map(str.split, trace.read_text().splitlines()), strict=True)
+    assert set(names) == {"__main__"} and len({*processes, str(server.pid)}) == 5
+    jobs.close()  # as where Snakemake is killed
+    server.join(10)
+    assert server.exitcode is not None
