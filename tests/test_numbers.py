@@ -10,7 +10,7 @@ import pytest
 from invented import table_for_claims
 
 from mace_rl.config.study import Study
-from mace_rl.results import claims
+from mace_rl.results import claims, claims_text
 from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed
 from tools.shown import results, runs
 
@@ -93,7 +93,7 @@ def test_means_and_solved_seeds(tmp_path: Path) -> None:
 def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
     frame = table_for_claims(20, {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}, noise=0.02)
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    text = claims.as_json(claims.ledger(frame, settings), {"runs": 1})
+    text = claims_text.as_json(claims.ledger(frame, settings), {"runs": 1})
     (tmp_path / "claims.json").write_text(text, encoding="utf-8")
     (line,) = results.headline(tmp_path)
     assert "10 claims: 9 reproduced, 1 contradicted, 0 inconclusive" in line

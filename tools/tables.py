@@ -39,7 +39,7 @@ SHARED = (
     *("gymnasium", "smart_open", "nbformat", "rich.live", "pandas", "seaborn", "fontTools.subset"),
     *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
     *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
-    *(f"mace_rl.results.{name}" for name in ("claims", "comparisons", "pictures", "readings")),
+    *(f"mace_rl.results.{name}" for name in ("claims_text", "comparisons", "pictures", "readings")),
 )
 fork = multiprocessing.get_context("fork")
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mace_rl.results.claims import LEVEL, LITERAL, ROBUST, WORTH_MENTIONING, parts_table
+from mace_rl.results.claims import LEVEL, LITERAL, ROBUST, WORTH_MENTIONING
+from mace_rl.results.claims_text import parts_table
 from mace_rl.results.paper import PPO
 from mace_rl.results.statistics import probability_of_improvement
 from tools.shown.cells import SETTINGS, mean, number, percent, short

@@ -7,7 +7,7 @@ with job("claims", snakemake.log[0]):
 
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results import claims
+    from mace_rl.results import claims, claims_text
     from mace_rl.results.metrics_table import read_metrics
     from mace_rl.results.paper import FULL
     from mace_rl.runs.finished import read_runs
@@ -29,6 +29,6 @@ with job("claims", snakemake.log[0]):
     ledger = claims.ledger(table, settings)
     seconds = sum(read_record(Path(path))["seconds"] for path in records)
     cost = {"command": params.command, "runs": len(table), "core_hours": seconds / 3600}
-    write_atomically(snakemake.output.json, claims.as_json(ledger, cost))
+    write_atomically(snakemake.output.json, claims_text.as_json(ledger, cost))
     origin = f"`{cost['command']}`: {cost['runs']} runs, {cost['core_hours']:.1f} core-hours."
-    write_atomically(snakemake.output.markdown, claims.markdown(ledger, origin))
+    write_atomically(snakemake.output.markdown, claims_text.markdown(ledger, origin))

@@ -20,7 +20,8 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.report.animations import Animations
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
-from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, digits_of
+from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST
+from mace_rl.results.claims_text import digits_of
 from mace_rl.results.figures import quantity
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.metrics_table import read_metrics

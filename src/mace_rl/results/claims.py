@@ -4,7 +4,6 @@ A claim is made of parts, each a comparison of two variants; a part holds, fails
 claim is reproduced, contradicted or inconclusive. Everything here was fixed before the study ran.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -35,6 +34,7 @@ from mace_rl.results.statistics import (
 
 CORRELATION = "stagnation_correlation"  # of stagnation and the β that follows; over 0
 
+CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
 WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
@@ -216,26 +216,31 @@ def outcome(finding: Finding) -> str:
 
 
 def _judge(findings: list[Finding]) -> None:
-    """Correct the p values of all parts together, and say what each came out as."""
-    tested = [finding for finding in findings if not np.isnan(finding.p_value)]
-    corrected = holm([finding.p_value for finding in tested])
-    for finding, p_holm in zip(tested, corrected, strict=True):
+    """Correct the p values of all parts together, and say what each came out as.
+
+    A part that one seed leaves without a p value counts as one of 1.
+    """
+    p_values = np.array([finding.p_value for finding in findings])
+    untested = np.isnan(p_values)
+    corrected = np.where(untested, np.nan, holm(np.where(untested, 1.0, p_values)))
+    for finding, p_holm in zip(findings, corrected, strict=True):
         finding.p_holm = float(p_holm)
-    for finding in findings:
         finding.outcome = outcome(finding)
 
 
 def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
     """Estimates and test of one part of a claim."""
     metrics = {metric.name: metric for metric in all_metrics(settings)}
-    pairs = [_pair(part, table[table["env"] == env], metrics) for env in part.environments]
-    everything = [_everything(part, table, env, metrics, settings) for env in part.environments]
+    both = table[table["variant"].isin([part.variant, part.baseline])]
+    runs = {env: both[both["env"] == env] for env in part.environments}
+    pairs = [_pair(part, own, metrics) for own in runs.values()]
+    everything = [_everything(part, own, env, metrics, settings) for env, own in runs.items()]
     unit: str = metrics[part.metric].unit if part.metric in metrics else "correlation"
     if len(pairs) > 1:
         pairs = [(x / all_, y / all_) for (x, y), all_ in zip(pairs, everything, strict=True)]
         everything, unit = [1.0], "share of everything"
     differences = [x - y for x, y in pairs]
-    how = settings.confidence, settings.bootstrap_repetitions
+    how = CONFIDENCE, settings.bootstrap_repetitions
     compared = stratified_comparison(
         differences, *how, np.random.default_rng(settings.bootstrap_seed)
     )
@@ -246,7 +251,7 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
         min(len(difference) for difference in differences),
         *compared,
         *chance,
-        _detectable(differences, settings.confidence),
+        _detectable(differences),
         WORTH_MENTIONING * everything[0],
         _in_paper(part, claim) if unit == "episodes" else np.nan,
     )
@@ -255,9 +260,14 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
 def _pair(
     part: Part, runs: pd.DataFrame, metrics: Mapping[str, Metric]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The metric of both variants, [seeds] each, in the order of seeds; greater is better."""
+    """The metric of both variants, [seeds] each, in the order of seeds; greater is better.
+
+    runs: those of both in one environment. Episodes beyond the shorter budget count as it.
+    """
     episodes = part.metric in metrics and metrics[part.metric].unit == "episodes"
     wide = runs.pivot(index="seed", columns="variant", values=part.metric).astype(np.float64)
+    if episodes:
+        wide = wide.clip(upper=runs["episodes"].min())
     variant = wide[part.variant].dropna().to_numpy()
     baseline = np.zeros_like(variant)
     if part.baseline is not None:
@@ -270,27 +280,27 @@ def _pair(
 
 def _everything(
     part: Part,
-    table: pd.DataFrame,
+    runs: pd.DataFrame,
     environment: str,
     metrics: Mapping[str, Metric],
     settings: MetricsConfig,
 ) -> float:
-    """All that a difference could be."""
+    """All that a difference could be between these runs of the part's variants."""
     if part.metric == CORRELATION:
         return 1.0
     if metrics[part.metric].unit == "episodes":
-        return float(table.loc[table["env"] == environment, "episodes"].min())
+        return float(runs["episodes"].min())
     return settings.reference_return[environment] - settings.random_return_in(environment)
 
 
-def _detectable(differences: Sequence[np.ndarray], confidence: float) -> float:
+def _detectable(differences: Sequence[np.ndarray]) -> float:
     """The smallest mean difference that is significant with a probability of `POWER`."""
-    freedom = sum(len(values) - 1 for values in differences)
-    if freedom == 0:
+    if min(len(values) for values in differences) == 1:
         return np.nan
+    freedom = sum(len(values) - 1 for values in differences)
     variances = [np.var(values, ddof=1) / len(values) for values in differences]
     error = np.sqrt(np.sum(variances)) / len(differences)
-    quantiles = scipy.special.stdtrit(freedom, [(1 + confidence) / 2, POWER])
+    quantiles = scipy.special.stdtrit(freedom, [(1 + CONFIDENCE) / 2, POWER])
     return float(quantiles.sum() * error)
 
 
@@ -315,84 +325,3 @@ def _paper(claim: Claim) -> str:
     names = {PPO: "PPO", FIXED: "fixed", FULL: "full"}
     numbers = ", ".join(f"{names[name]} {value}" for name, value in values.items())
     return f"{PAPER_METRICS[column]}: {numbers}; the best is {names[first]}"
-
-
-def as_json(records: Sequence[Mapping[str, Any]], cost: Mapping[str, Any]) -> str:
-    """The data of claims.json: what it cost, then the records of `ledger`."""
-    whole = {"cost": cost, "claims": records}
-    return json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def markdown(records: Sequence[Mapping[str, Any]], origin: str) -> str:
-    """The ledger to read: a table of verdicts, then every part; `origin` says how it was made."""
-    lines = [
-        "# Does it hold?",
-        "",
-        f"{origin} The rule of the verdicts: docs/method.md.",
-        "",
-        f"| | claim | {LITERAL} | {ROBUST} | the paper's Table 1 |",
-        "|---|---|---|---|---|",
-    ]
-    for record in records:
-        verdicts = " | ".join(f"**{record[how]['verdict']}**" for how in (LITERAL, ROBUST))
-        lines.append(
-            f"| {record['claim']} | {record['statement']} | {verdicts} | {record['paper']} |"
-        )
-    for how in (LITERAL, ROBUST):
-        lines += [
-            "",
-            f"## Part by part: {how}",
-            "",
-            "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
-            " *P*: that a run of the first is better. *Margin*: what counts as an advantage worth"
-            f" mentioning. *Detectable*: the smallest that these seeds show with a power of"
-            f" {POWER:.0%}, before correction.",
-            "",
-            *parts_table(records, how),
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def parts_table(records: Sequence[Mapping[str, Any]], how: str) -> list[str]:
-    """Every part of every claim, measured in one of the two ways, as lines of Markdown."""
-    columns = ["", "environment", "metric", "over", "n", "difference", "p (Holm)", "P", "paper"]
-    columns += ["margin", "detectable", ""]
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for record in records:
-        for part in record[how]["parts"]:
-            lines.append(f"| {' | '.join([record['claim'], *_cells(part)])} |")
-    return lines
-
-
-def digits_of(part: Mapping[str, Any]) -> int:
-    """How many digits after the point the numbers of a part are shown with."""
-    return {"episodes": 0, "return": 1}.get(part["unit"], 3)
-
-
-def _cells(part: Mapping[str, Any]) -> list[str]:
-    """What the table has of one part."""
-    digits = digits_of(part)
-    names = ("difference", "low", "high", "in_paper", "worth_mentioning", "detectable")
-    difference, low, high, paper, margin, detectable = (_shown(part[x], digits) for x in names)
-    chance = [_shown(part[f"probability{end}"], 2) for end in ("", "_low", "_high")]
-    return [
-        "all" if len(part["environments"]) > 1 else part["environments"][0],
-        part["metric"],
-        f"{part['variant']} over {part['baseline'] or '0'}",
-        str(part["seeds"]),
-        f"{difference} ({low} to {high})",
-        _shown(part["p_holm"], 3),
-        f"{chance[0]} ({chance[1]} to {chance[2]})",
-        paper,
-        margin,
-        detectable,
-        part["outcome"],
-    ]
-
-
-def _shown(value: float | None, digits: int) -> str:
-    """A number with a true minus, and without one before a zero; a dash where there is none."""
-    if value is None:
-        return "–"
-    text = f"{value:.{digits}f}"
-    return text.replace("-", "−" if float(text) else "")
