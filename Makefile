@@ -22,6 +22,9 @@ SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 # Each process of the tests takes some 400 MB. What shares a finished study stays in one of them.
 PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
 
+# $(call one_of,NAME,VALUE): stop where the variable has another value.
+one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
+
 .DEFAULT_GOAL := all
 .PHONY: all quick test test-quick tables numbers report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
 
@@ -31,7 +34,7 @@ all: setup ## the paper's study: every run, table and figure, at the paper's bud
 quick: setup ## the same at small budgets, to see it work (minutes)
 	@$(SNAKEMAKE) all --configfile config/reduced.yaml
 
-test: setup ## every test, on every core
+test: setup ## every test, on up to 8 cores
 	@$(PYTEST)
 
 test-quick: setup ## the tests that take seconds, for the edit loop
@@ -47,13 +50,15 @@ report: setup ## one page of a kept study, without training: verdicts, figures, 
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)
 
 bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour; BENCH=quick: a few)
-	@$(IN_VENV) benchmarks $(if $(filter quick,$(BENCH)),--quick)
+	@$(call one_of,BENCH,quick)
+	@$(IN_VENV) benchmarks $(if $(BENCH),--quick)
 
 verify: setup ## repeat a sample of the runs in reference/ and compare to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
-	@$(IN_VENV) tools.cross_cpu $(if $(filter short,$(CROSS)),--short)
+	@$(call one_of,CROSS,short)
+	@$(IN_VENV) tools.cross_cpu $(if $(CROSS),--short)
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
 	@$(IN_VENV) tools.kill_test

@@ -61,6 +61,8 @@ def main() -> None:
     for i, seed in enumerate(seeds):
         for curious in (False, True):
             returns = train(arguments.environment, curious, seed, arguments.steps)
+            if not len(returns):
+                sys.exit(f"sb3_ppo: no episode ended in --steps {arguments.steps}: give more")
             last = returns[-max(len(returns) // 10, 1) :]
             found[:, int(curious), i] = returns.mean(), last.mean()
         row = [f"{value:.2f}" for value in found[:, :, i].ravel()]

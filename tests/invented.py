@@ -1,6 +1,7 @@
 """What tests of the results share: settings, and records and tables that no run has given."""
 
 import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,8 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import check
 from mace_rl.results.aggregate import SCORED
 from mace_rl.results.claims import CORRELATION
+from mace_rl.results.metrics import Metric, metrics_columns
+from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 
 SETTINGS = {
     "final_fraction": 0.1,
@@ -42,6 +45,27 @@ def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:
     """The records of a run with these returns, every episode of this length."""
     episodes = np.arange(1, len(returns) + 1)
     return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
+
+
+def table_for_tables(
+    metrics: Sequence[Metric],
+    environments: Sequence[str] = ENVIRONMENTS,
+    variants: Sequence[str] = VARIANTS,
+    seeds: int = 3,
+    **values: Mapping[str, Sequence[float]],
+) -> pd.DataFrame:
+    """A metrics.csv; `values` are per variant, [seeds] each: `sample_efficiency={"ppo": [...]}`."""
+    draws = np.random.default_rng(0)
+    rows = []
+    for environment, variant, seed in itertools.product(environments, variants, range(seeds)):
+        row: dict[str, object] = dict.fromkeys(metrics_columns(metrics), 0)
+        row |= {metric.name: int(draws.integers(100, 990)) for metric in metrics}
+        row |= {"env": environment, "variant": variant, "seed": seed, "episodes": 2000}
+        row |= {"convergence_steps": int(draws.integers(1000, 2000))}
+        row |= {"final_return": -85.25, "area_under_curve": -116.75}
+        row |= {name: given[variant][seed] for name, given in values.items()}
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:

@@ -5,10 +5,12 @@ import json
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
@@ -119,6 +121,15 @@ def call(monkeypatch, *words: str) -> tuple[int, str]:
     except SystemExit as exit_:
         return (exit_.code, "") if isinstance(exit_.code, int) else (1, str(exit_.code))
     return 0, ""
+
+
+def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
+    """What the tool exits with."""
+    monkeypatch.setattr("sys.argv", [tool.__name__, *words])
+    with pytest.raises(SystemExit) as ended:
+        tool.main()
+    assert isinstance(ended.value.code, str) and "\n" not in ended.value.code
+    return ended.value.code
 
 
 class Bonanza(gymnasium.Env):

@@ -1,17 +1,26 @@
 """Comparisons and regret from a small frame, against scipy, enumeration and loops."""
 
+from functools import partial
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from test_tables import METRICS, SETTINGS, metrics
+from invented import table_for_tables
 
 from mace_rl.config.results import RegretConfig
+from mace_rl.config.study import read_study
 from mace_rl.results.comparisons import comparisons, regret
+from mace_rl.results.metrics import all_metrics
 from mace_rl.results.statistics import logrank, probability_of_improvement
 
+SETTINGS = read_study([Path(__file__).parents[1] / "config.yaml"]).metrics.model_copy(
+    update={"bootstrap_repetitions": 1000}
+)
+METRICS = all_metrics(SETTINGS)
+metrics = partial(table_for_tables, METRICS)
 UNITS = {metric.name: metric.unit for metric in METRICS}
 HOW = (0.95, SETTINGS.bootstrap_repetitions)
 

@@ -46,6 +46,12 @@ def test_help_and_mistakes():
         assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")
 
 
+def test_too_few_steps_for_an_episode_are_said():
+    done = run("--environment", "Acrobot-v1", "--steps", "1", "--seeds", "1")
+    assert done.returncode == 1 and "nan" not in done.stdout
+    assert done.stderr == "sb3_ppo: no episode ended in --steps 1: give more\n"
+
+
 def test_curiosity_changes_the_policy_and_not_what_is_counted():
     train = runpy.run_path(str(EXAMPLE))["train"]
     without, with_curiosity = (train("DeepSea10-v0", curious, 1000, 1536) for curious in (0, 1))

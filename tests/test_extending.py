@@ -111,9 +111,9 @@ def test_numbers_out_of_range_stop_the_run_at_once(folder, name, file, old, new,
 def test_example_metric(folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
-    settings = read_study([ROOT / "config.yaml", folder / "solved.yaml"]).metrics
+    settings = read_study([ROOT / "config.yaml", folder / "to_100.yaml"]).metrics
     *_, metric = all_metrics(settings)
-    assert (metric.name, metric.label) == ("solved", "Episodes to 100")
+    assert (metric.name, metric.label) == ("to_100", "Episodes to 100")
     for returns, expected in (
         ([0.0] * 20 + [150.0] * 20, (27, False)),  # 7 of the last 10 are 150: 105
         ([99.0] * 40, (40, True)),

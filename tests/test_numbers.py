@@ -136,18 +136,20 @@ def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
     assert line == "| ppo | 3 [1] / 6 |"
 
 
-def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(tmp_path: Path) -> None:
+    file, heads = tmp_path / "bonus_share.csv", "env,variant,seeds,first,last"
     for seed, scale in enumerate((1, 3)):
         run = tmp_path / "A-v0" / "beta_1" / f"seed{seed}"
         run.mkdir(parents=True)
         shares = [scale * n / 100 for n in range(20)]  # 0.00, 0.01; …; 0.18, 0.19, times scale
         pd.DataFrame({"bonus_share": shares}).to_csv(run / "diagnostics.csv", index=False)
-    bonus_share.main(tmp_path, ["beta_1", "beta_2"])
-    measured = capsys.readouterr().out
-    assert measured.splitlines() == ["env,variant,seeds,first,last", "A-v0,beta_1,2,0.0100,0.3700"]
-    (tmp_path / "bonus_share.csv").write_text(measured + "B-v0,beta_2,2,0.5,0.25\n")
+    bonus_share.main(file, tmp_path, ["beta_1", "beta_2"])
+    measured = "A-v0,beta_1,2,0.0100,0.3700"
+    assert file.read_text().splitlines() == [heads, measured]
+    other = "B-v0,beta_2,2,0.5000,0.2500"
+    file.write_text("\n".join([heads, other, "A-v0,beta_1,9,0.9,0.9"]))  # the last is of before
+    bonus_share.main(file, tmp_path, ["beta_1"])
+    assert file.read_text().splitlines() == [heads, measured, other]
     assert runs.shares(tmp_path) == [
         "| | seeds | beta_1 | beta_2 |",
         "|---|---|---|---|",
@@ -155,7 +157,7 @@ def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(
         "| B-v0 | 2 |  | 0.50 / 0.25 |",
     ]
     with pytest.raises(SystemExit, match=r"no diagnostics\.csv of beta_2"):
-        bonus_share.main(tmp_path, ["beta_2"])
+        bonus_share.main(file, tmp_path, ["beta_2"])
 
 
 def test_the_betas_of_each_seed_are_in_order_of_size(tmp_path: Path) -> None:

@@ -2,29 +2,23 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import pytest
-from shared import Bonanza
+from shared import Bonanza, message
 
-from tools import convergence_simulation, random_return, show, tables
+from tools import convergence_simulation, random_return, show
 
-
-def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
-    """What the tool exits with."""
-    monkeypatch.setattr("sys.argv", [tool.__name__, *words])
-    with pytest.raises(SystemExit) as ended:
-        tool.main()
-    assert isinstance(ended.value.code, str) and "\n" not in ended.value.code
-    return ended.value.code
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["Foo-v0", "3"], "ENVIRONMENT is 'Foo-v0', which cannot be made: "),
-        (["CartPole-v9", "3"], "ENVIRONMENT is 'CartPole-v9', which cannot be made: "),
-        (["nope:Foo-v0", "3"], "ENVIRONMENT is 'nope:Foo-v0', which cannot be made: "),
+        (["Foo-v0", "3"], "config.yaml: environments has 'Foo-v0', which is not in Gymnasium's"),
+        (["CartPole-v9", "3"], "config.yaml: environments has 'CartPole-v9', which is not in"),
+        (["nope:Foo-v0", "3"], "config.yaml: in the settings of nope:Foo-v0 and"),
+        (["CliffWalking-v1", "3"], "config.yaml: environments has 'CliffWalking-v1', which has no"),
+        (["CartPole-v1", "3", "no.yaml"], "no.yaml: cannot be read: "),
         (["CartPole-v1", "1"], "EPISODES is 1, but should be at least 2"),
         (["CartPole-v1", "-3"], "EPISODES is -3, but should be at least 2"),
     ],
@@ -50,6 +44,21 @@ def test_a_random_return_is_that_of_random_actions(
     assert float(words[-1]) == pytest.approx(2.5, rel=0.4)
 
 
+def test_a_random_return_is_that_of_the_study_s_environment(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    register: Callable[..., str],
+    tmp_path: Path,
+) -> None:
+    """Half of as many choices as the configuration allows."""
+    name = register("Bonanza-v0", Bonanza, 1000)
+    settings = f"environment_settings:\n  {name}: {{max_episode_steps: 100}}\n"
+    (tmp_path / "short.yaml").write_text(settings)
+    monkeypatch.setattr("sys.argv", ["random_return", name, "40", str(tmp_path / "short.yaml")])
+    random_return.main()
+    assert float(capsys.readouterr().out.split()[1]) == pytest.approx(50, abs=4)
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -65,7 +74,7 @@ def test_a_random_return_is_that_of_random_actions(
 def test_what_is_not_there_to_be_shown(
     monkeypatch: pytest.MonkeyPatch, words: list[str], expected: str
 ) -> None:
-    monkeypatch.chdir(Path(__file__).parents[1] / "reference" / "tables")
+    monkeypatch.chdir(ROOT / "reference" / "tables")
     assert message(monkeypatch, show, *words).startswith(f"show: {expected}")
 
 
@@ -88,25 +97,3 @@ def test_a_folder_that_gives_no_column(
     said = message(monkeypatch, convergence_simulation, str(folder))
     assert said.startswith("convergence_simulation: ") and expected in said
     assert files == ["Foo-v0/ppo/seed0/episodes.csv"] or str(folder) in said
-
-
-def test_tables_runs_each_script_in_a_process_of_its_own_and_hears_how_it_ended(
-    tmp_path: Path,
-) -> None:
-    script, trace = tmp_path / "script.py", tmp_path / "trace"
-    jobs, scripts = tables.fork.Pipe()
-    server = tables.fork.Process(target=tables.run_scripts, args=(jobs, scripts))
-    server.start()
-    scripts.close()
-    note = f"import os\nopen({str(trace)!r}, 'a').write(f'{{__name__}} {{os.getpid()}}\\n')\n"
-    found = []
-    for end in ("", "raise SystemExit(3)", "raise ValueError", "os.kill(os.getpid(), 9)"):
-        script.write_text(note + end, encoding="utf-8")
-        jobs.send(str(script))
-        found.append(jobs.recv())
-    assert found == [0, 3, 1, -9]
-    names, processes = zip(*map(str.split, trace.read_text().splitlines()), strict=True)
-    assert set(names) == {"__main__"} and len({*processes, str(server.pid)}) == 5
-    jobs.close()  # as where Snakemake is killed
-    server.join(10)
-    assert server.exitcode is not None

@@ -1,10 +1,10 @@
 """Measure the bonus's share of the total advantage in the first and last tenth of the updates.
 
-    .venv/bin/python -m tools.bonus_share RUNS VARIANT ... > reference/measured/bonus_share.csv
+    .venv/bin/python -m tools.bonus_share FILE RUNS VARIANT ...
 
 RUNS is a folder of runs, such as results/controls/runs, with their diagnostics.csv, which
-reference/study does not keep. A row for each environment and variant, means over seeds;
-`tools.show shares reference/measured` prints them as a table.
+reference/study does not keep. A row for each environment and variant, means over seeds, replaces
+what FILE (CSV) had of both; that is reference/measured/bonus_share.csv for `tools.show shares`.
 """
 
 import argparse
@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from mace_rl.files import write_atomically
+
 
 def first_and_last(diagnostics: Path) -> tuple[float, float]:
     """The mean share in the first and in the last tenth of a run's updates."""
@@ -22,8 +24,8 @@ def first_and_last(diagnostics: Path) -> tuple[float, float]:
     return float(share[:tenth].mean()), float(share[-tenth:].mean())
 
 
-def main(runs: Path, variants: list[str]) -> None:
-    """Print the rows as CSV; exits with one line if there are none."""
+def main(file: Path, runs: Path, variants: list[str]) -> None:
+    """Put the rows into `file`; exits with one line if there are none."""
     rows = []
     for environment in sorted(runs.glob("*")):
         for variant in variants:
@@ -34,15 +36,20 @@ def main(runs: Path, variants: list[str]) -> None:
     if not rows:
         sys.exit(f"bonus_share: {runs} has no diagnostics.csv of {', '.join(variants)}")
     table = pd.DataFrame(rows, columns=["env", "variant", "seeds", "first", "last"])
-    print(table.to_csv(index=False, float_format="%.4f"), end="")
+    if file.exists():
+        table = pd.concat([pd.read_csv(file), table])
+        table = table.drop_duplicates(["env", "variant"], keep="last")
+    table = table.sort_values(["env", "variant"])
+    write_atomically(file, table.to_csv(index=False, float_format="%.4f"))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog="example: python -m tools.bonus_share results/controls/runs beta_0.4 beta_1",
+        epilog="example: python -m tools.bonus_share shares.csv results/controls/runs beta_0.4",
     )
+    parser.add_argument("file", type=Path, help="where the rows go")
     parser.add_argument("runs", type=Path, help="a folder of runs, such as results/runs")
     parser.add_argument("variants", nargs="+", help="such as beta_0.4")
     arguments = parser.parse_args()
-    main(arguments.runs, arguments.variants)
+    main(arguments.file, arguments.runs, arguments.variants)

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 from mace_rl import files
+from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 
 ROOT = Path(__file__).resolve().parent.parent
 QEMU = "qemu-x86_64"
@@ -38,8 +39,6 @@ QEMU = "qemu-x86_64"
 OLDEST_QEMU = (9, 1)
 HERE = "here"
 PROCESSORS = ("Haswell", "EPYC", "Dhyana")  # by Intel, AMD, and Hygon, which few libraries know
-ENVIRONMENTS = ("Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0")
-VARIANTS = ("ppo", "mace_fixed", "mace_full")
 HALVED = "mace_full"  # the variant with most in its checkpoint
 # More than the 10 updates after which the meta network learns.
 EPISODES = {"Acrobot-v1": 14, "CartPole-v1": 60, "HopperBulletEnv-v0": 60}

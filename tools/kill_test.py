@@ -2,7 +2,7 @@
 
     python -m tools.kill_test [--repeats N] [--seed S]        (make kill-test)
 
-Every environment and variant of config.yaml is trained once undisturbed. Then, for each, a training
+Every environment and variant of the paper is trained once undisturbed. Then, for each, a training
 is killed (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its
 results, and the same command is given again. At last a small workflow gets SIGINT, SIGTERM and
 SIGKILL. What is there in the end has to equal the undisturbed run byte for byte, with nothing left.
@@ -23,10 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl import files
+from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 
 ROOT = Path(__file__).resolve().parent.parent
-ENVIRONMENTS = ("Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0")
-VARIANTS = ("ppo", "mace_fixed", "mace_full")
 EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
 # Checkpoints as fast as they can be written: the moments to hit are then all through the training.
 TRAIN = "import mace_rl.runs.run as r; r.CHECKPOINT_SECONDS = 0.05; r.CHECKPOINT_COST = 1.0; "

@@ -12,6 +12,7 @@ which is reference/measured/meta_signal.csv for `tools.show signals`.
 
 import argparse
 import copy
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -23,9 +24,8 @@ from threadpoolctl import threadpool_limits
 from mace_rl.agent.advantages import normalised, normalised_change, root_mean_square
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import ConstantBeta
-from mace_rl.config.study import load_study
+from mace_rl.config.section import ConfigError
 from mace_rl.experience import (
     Experience,
     extrinsic_part,
@@ -38,9 +38,10 @@ from mace_rl.factories import beta_controller
 from mace_rl.files import write_atomically
 from mace_rl.streams import Streams
 from mace_rl.train import Trainer
+from tools.random_return import study_of
 
 BETA, STEP = 0.4, 0.05
-PROBES = 60  # updates of a run whose finite difference is taken
+PROBES = 60  # updates of a run whose finite difference is taken, evenly over its episodes
 
 
 class Probe(Trainer):
@@ -54,7 +55,7 @@ class Probe(Trainer):
         self.rows: dict[str, list[float]] = defaultdict(list)
         self.past: tuple[np.ndarray, np.ndarray, float] | None = None
         self.judge = judge
-        self.every = max(1, self.config.episodes // PROBES)
+        self.probed = 0
         for _ in self.run():
             pass
         return self.rows
@@ -88,8 +89,9 @@ class Probe(Trainer):
         influence = root_mean_square(np.concatenate([intrinsic_part(item) for item in rollout]))
         effect = Effect(preconditioned.astype(np.float32), influence)
         self.judge.judged.append(self.judge.judge(None, effect))
-        probed = len(self.diagnostics) % self.every == 0
-        difference = self.finite_difference(rollout) if probed else None
+        due = len(self.records) * PROBES // self.config.episodes > self.probed
+        self.probed += due
+        difference = self.finite_difference(rollout) if due else None
         for name, vector in (("plain", change), ("as Adam steps", preconditioned)):
             cosine = nan
             if difference is not None and np.linalg.norm(difference) > 0:
@@ -113,18 +115,12 @@ class Probe(Trainer):
 
 def main(file: Path, environment: str, episodes: int, seeds: int, overlays: list[str]) -> None:
     """Measure one environment, and put its rows into `file`."""
-    config = read_yaml(Path("config.yaml"))
-    for overlay in overlays:
-        config = merge(config, read_yaml(Path(overlay)))
-    config["environments"] = [environment]
-    config["metrics"]["random_return"].setdefault(environment, 0.0)  # nothing is measured by it
-    own = config["environment_settings"].setdefault(environment, {})
-    own["episodes"] = episodes
-    study = load_study(config, "meta_signal.py")
+    study = study_of(environment, overlays)
     constant = ConstantBeta(kind="constant", value=BETA)
     runs = []
     for seed in range(1000, 1000 + seeds):
         settings = study.run_config(environment, "mace_full", seed)
+        settings = settings.model_copy(update={"episodes": episodes})
         probe = Probe(settings.model_copy(update={"beta": constant}))
         judge = beta_controller(settings, probe.environment, Streams(seed))
         assert isinstance(judge, MetaAdaptation)
@@ -156,9 +152,15 @@ if __name__ == "__main__":
     parser.add_argument("seeds", type=int, help="how many, from 1000")
     parser.add_argument("configs", nargs="*", help="files over config.yaml")
     arguments = parser.parse_args()
+    for name in ("episodes", "seeds"):
+        if (count := getattr(arguments, name)) < 1:
+            sys.exit(f"meta_signal: {name.upper()} is {count}, but should be at least 1")
     torch.set_num_threads(1)
-    with threadpool_limits(1):
-        main(
-            *(arguments.file, arguments.environment, arguments.episodes),
-            *(arguments.seeds, arguments.configs),
-        )
+    try:
+        with threadpool_limits(1):
+            main(
+                *(arguments.file, arguments.environment, arguments.episodes),
+                *(arguments.seeds, arguments.configs),
+            )
+    except ConfigError as error:
+        sys.exit(f"meta_signal: {error}")

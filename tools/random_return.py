@@ -1,21 +1,46 @@
 """Measure the mean return of uniformly random actions, for `metrics.random_return` in config.yaml.
 
-.venv/bin/python -m tools.random_return ENVIRONMENT EPISODES
+.venv/bin/python -m tools.random_return ENVIRONMENT EPISODES [CONFIG ...]
+
+The environment is the one that a study trains in: with the time limit and the arguments that
+config.yaml, and the files CONFIG read over it, set for it.
 """
 
 import argparse
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
-import mace_rl.environments  # noqa: F401  (registers our own)
+from mace_rl.config.reading import merge, read_yaml
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError
+from mace_rl.config.study import Study, load_study
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
-def random_returns(name: str, episodes: int) -> np.ndarray:
+def study_of(environment: str, overlays: list[str]) -> Study:
+    """The study of config.yaml and the files over it, in this environment alone.
+
+    `ConfigError` for what cannot be one; a random return is not asked for.
+    """
+    config = read_yaml(ROOT / "config.yaml")
+    for overlay in overlays:
+        config = merge(config, read_yaml(Path(overlay)))
+    config["environments"] = [environment]
+    config["metrics"]["random_return"].setdefault(environment, 0.0)
+    return load_study(config, " + ".join(["config.yaml", *overlays]))
+
+
+def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
     """Undiscounted return of each episode, [episodes], with seed 0."""
-    env = gymnasium.make(name)
+    env = gymnasium.make(
+        config.environment,
+        max_episode_steps=config.max_episode_steps,
+        **config.environment_arguments,
+    )
     env.action_space.seed(0)
     env.reset(seed=0)
     returns = np.zeros(episodes)
@@ -37,15 +62,16 @@ def main() -> None:
     )
     parser.add_argument("environment", help="its Gymnasium id")
     parser.add_argument("episodes", type=int)
+    parser.add_argument("configs", nargs="*", help="files over config.yaml")
     arguments = parser.parse_args()
     name, episodes = arguments.environment, arguments.episodes
     if episodes < 2:
         sys.exit(f"random_return: EPISODES is {episodes}, but should be at least 2")
     try:
-        measured = random_returns(name, episodes)
-    except (gymnasium.error.Error, ImportError) as error:
-        reason = " ".join(str(error).split())
-        sys.exit(f"random_return: ENVIRONMENT is {name!r}, which cannot be made: {reason}")
+        config = study_of(name, arguments.configs).run_config(name, "ppo", 0)
+    except ConfigError as error:
+        sys.exit(f"random_return: {error}")
+    measured = random_returns(config, episodes)
     standard_error = measured.std(ddof=1) / np.sqrt(episodes)
     print(f"{name}: {measured.mean():.4g} (standard error {standard_error:.2g})")
 

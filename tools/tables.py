@@ -160,7 +160,9 @@ def main() -> None:
     studies = read_yaml(STUDIES)
     if only and only not in studies:
         sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
-    shutil.rmtree(MADE, ignore_errors=True)
+    for stale in [MADE / "runs", MADE / only] if only else [MADE]:
+        if stale.exists():
+            shutil.rmtree(stale)
     with ThreadPoolExecutor(1) as beside:
         unpacked = beside.submit(archive.unpack, KEPT, MADE)
         for module in SHARED:

@@ -29,9 +29,10 @@ def short(value: float | str) -> str:
     return f"{float(value):.4g}".replace("-", "−") if value != "" else ""
 
 
-def number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}".replace("-", "−")
+def number(value: float | str, digits: int) -> str:
+    """As many digits after the point, with a true minus; an empty cell stays empty."""
+    return f"{float(value):z.{digits}f}".replace("-", "−") if value != "" else ""
 
 
 def percent(share: float) -> str:
-    return f"{100 * share:.2f} %".replace("-", "−")
+    return f"{100 * share:z.2f} %".replace("-", "−")

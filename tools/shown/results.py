@@ -128,8 +128,9 @@ def regret(folder: Path) -> list[str]:
     lines = ["| | best constant | its return | learned β | regret | seeds |", "|---" * 6 + "|"]
     for _, row in pd.read_csv(folder / "regret.csv", keep_default_na=False).iterrows():
         cells = [row["env"], row["best_constant"], *map(short, row[["best_area", "variant_area"]])]
-        regret, low, high = (number(float(row[name]), 4) for name in ("regret", "low", "high"))
-        lines.append(f"| {' | '.join(cells)} | {regret} ({low} to {high}) | {row['seeds']} |")
+        regret, low, high = (number(row[name], 4) for name in ("regret", "low", "high"))
+        interval = f" ({low} to {high})" if low else ""
+        lines.append(f"| {' | '.join(cells)} | {regret}{interval} | {row['seeds']} |")
     return lines
 
 

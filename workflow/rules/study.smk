@@ -44,10 +44,9 @@ RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
 RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
-# The claim ledger is for a study that has all the paper makes claims of.
-TESTS_CLAIMS = set(paper.ENVIRONMENTS) <= set(MEASURED.reference_return) and set(
-    paper.VARIANTS
-) <= set(study.variants)
+# The claim ledger is for a study that has all the paper makes claims of, and one bar for all.
+HAS_PAPERS = paper.has_all(study.environments, study.variants)
+TESTS_CLAIMS = HAS_PAPERS and bool(MEASURED.reference_return)
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
 # The regret of a learnt β only where the configuration asks for it.
 PICTURES = ["every_seed", "profiles"]

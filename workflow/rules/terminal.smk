@@ -54,6 +54,10 @@ onstart:
     watched = Study(watched_runs(), due, cores, workflow.execution_settings.retries)
     for line in study.metrics.incomplete(study.environments):
         logger.info(line)
+    if HAS_PAPERS and not TESTS_CLAIMS:
+        logger.info(
+            "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
+        )
     logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra={"study": watched})
 
 

@@ -51,7 +51,7 @@ class MetricsConfig(Section):
         if environment not in self.random_return:
             raise ConfigError(
                 f"the key 'metrics.random_return.{environment}' is missing: the mean return of"
-                f" uniformly random actions in {environment}"
+                f" uniformly random actions in {environment}, which tools.random_return measures"
             )
         return self.random_return[environment]
 

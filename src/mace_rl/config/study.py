@@ -158,6 +158,12 @@ def load_study(config: Any, origin: str) -> Study:
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
+        for label, count in Counter(study.labels.values()).items():
+            if count > 1:
+                raise ConfigError(
+                    f"variant_settings has the label {label!r} {count} times, but each of variants"
+                    " should have one of its own"
+                )
         for pair in study.metrics.comparisons:
             for variant in pair:
                 _check_known(

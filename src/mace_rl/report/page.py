@@ -25,11 +25,11 @@ from mace_rl.results.claims_text import digits_of
 from mace_rl.results.figures import quantity
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.metrics_table import read_metrics
-from mace_rl.results.paper import PAPER_METRICS
+from mace_rl.results.paper import PAPER_METRICS, has_all
 from mace_rl.results.pictures import draw_every_seed, draw_profiles, draw_regret
 from mace_rl.results.readings import draw_readings, in_order, ranked, title
 from mace_rl.results.records import RunKey
-from mace_rl.results.tables import DIGITS, from_to
+from mace_rl.results.tables import digits_by_metric, from_to
 
 TEMPLATE = Path(__file__).with_name("page.html")
 FIGURES = ("1", "2")
@@ -103,9 +103,14 @@ def page(
     return environment.get_template(TEMPLATE.name).render(
         claims=_claims(tables.claims),
         counts=_counts(tables.claims),
+        no_common_bar=has_all(tables.metrics["env"], labels) and not settings.reference_return,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
-        few=int(seeds.min()) if seeds.min() < FEWEST_SEEDS else None,
+        few=[
+            env
+            for env, own in tables.metrics.groupby("env", sort=False)
+            if own["variant"].value_counts().min() < FEWEST_SEEDS
+        ],
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(seeds),
@@ -132,8 +137,10 @@ def page(
         pictures=_pictures(tables, settings, labels, colours),
         readings=_readings(tables.readings, settings),
         aggregate=tables.aggregate.to_dict("records"),
-        comparisons=_with_units(tables.comparisons, settings),
-        supplement=_with_units(tables.supplement, settings),
+        comparisons=_with_units(
+            tables.comparisons, pd.concat([tables.table1, tables.supplement]), settings
+        ),
+        supplement=_with_units(tables.supplement, tables.supplement, settings),
         regret=None if tables.regret is None else tables.regret.to_dict("records"),
         costs=_costs(making.records, tables.metrics),
         total=_total(making.records),
@@ -148,8 +155,7 @@ def number(value: float | None, digits: int = 0) -> str:
     """A number as it is printed; a dash where there is none."""
     if value is None or np.isnan(value):
         return "–"
-    text = f"{value:,.{digits}f}".replace(",", "\u202f")  # a narrow space
-    return text.replace("-", "−") if float(f"{value:.{digits}f}") else text.replace("-", "")
+    return f"{value:z,.{digits}f}".replace(",", "\u202f").replace("-", "−")  # a narrow space
 
 
 def duration(seconds: float) -> str:
@@ -214,7 +220,12 @@ def _table1(table: pd.DataFrame) -> list[dict[str, Any]]:
         for cell in cells:
             paper = None if pd.isna(cell.paper) else int(cell.paper)
             rows.setdefault(cell.variant, []).append(
-                cell._asdict() | {"paper": paper, "best": round(cell.mean) == best.get(cell.metric)}
+                cell._asdict()
+                | {
+                    "paper": paper,
+                    "best": cell.censored < cell.seeds
+                    and round(cell.mean) == best.get(cell.metric),
+                }
             )
         blocks.append({"environment": environment, "rows": rows})
     return blocks
@@ -250,14 +261,21 @@ def _readings(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, An
     return rows
 
 
-def _with_units(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[Any, Any]]:
-    """Rows on metrics, with these as they are called and how many digits their values have."""
-    metrics = {metric.name: metric for metric in all_metrics(settings)}
-    rows = []
-    for row in table.to_dict("records"):
-        metric = metrics[row["metric"]]
-        rows.append({**row, "metric": metric.label, "digits": DIGITS[metric.unit]})
-    return rows
+def _with_units(
+    table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig
+) -> list[dict[Any, Any]]:
+    """Rows on metrics, with these as they are called and how many digits their `means` have."""
+    labels = {metric.name: metric.label for metric in all_metrics(settings)}
+    digits = digits_by_metric(means, settings)
+    return [
+        # All environments together have no digits, and no values that would need them.
+        {
+            **row,
+            "metric": labels[row["metric"]],
+            "digits": digits.get((row["env"], row["metric"]), 0),
+        }
+        for row in table.to_dict("records")
+    ]
 
 
 def _costs(records: Sequence[Mapping[str, Any]], metrics: pd.DataFrame) -> list[dict[str, Any]]:

@@ -222,7 +222,7 @@ def _judge(findings: list[Finding]) -> None:
     """
     p_values = np.array([finding.p_value for finding in findings])
     untested = np.isnan(p_values)
-    corrected = np.where(untested, np.nan, holm(np.where(untested, 1.0, p_values)))
+    corrected = np.where(untested, np.nan, holm(np.where(untested, 1.0, p_values).tolist()))
     for finding, p_holm in zip(findings, corrected, strict=True):
         finding.p_holm = float(p_holm)
         finding.outcome = outcome(finding)

@@ -82,7 +82,4 @@ def _cells(part: Mapping[str, Any]) -> list[str]:
 
 def _shown(value: float | None, digits: int) -> str:
     """A number with a true minus, and without one before a zero; a dash where there is none."""
-    if value is None:
-        return "–"
-    text = f"{value:.{digits}f}"
-    return text.replace("-", "−" if float(text) else "")
+    return "–" if value is None else f"{value:z.{digits}f}".replace("-", "−")

@@ -1,5 +1,7 @@
 """What the paper has: its environments and variants, by our names for them, and its Table 1."""
 
+from collections.abc import Iterable
+
 ENVIRONMENTS = ACROBOT, CARTPOLE, HOPPER = "Acrobot-v1", "CartPole-v1", "HopperBulletEnv-v0"
 VARIANTS = PPO, FIXED, FULL = "ppo", "mace_fixed", "mace_full"
 
@@ -17,3 +19,8 @@ PAPER_TABLE1 = {
     (HOPPER, FIXED): (782, 1801),
     (HOPPER, FULL): (495, 1799),
 }
+
+
+def has_all(environments: Iterable[str], variants: Iterable[str]) -> bool:
+    """Whether a study of these has all that the paper makes claims of."""
+    return set(ENVIRONMENTS) <= set(environments) and set(VARIANTS) <= set(variants)

@@ -134,7 +134,8 @@ def draw_regret(
                 axes.errorbar(
                     place + 0.7 * (not own),
                     values.mean(),
-                    yerr=[[values.mean() - low], [high - values.mean()]],
+                    # Of equal values a bound and the mean may differ in the last bit.
+                    yerr=np.maximum(0, [[values.mean() - low], [high - values.mean()]]),
                     fmt="o",
                     markersize=3,
                     color="dimgray" if own else colours[name],

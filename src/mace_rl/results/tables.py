@@ -3,6 +3,7 @@
 The LaTeX is a fragment for \\input; it needs the package booktabs and nothing else.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.config.run import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.results.statistics import interval_kind, mean_interval
+from mace_rl.results.statistics import BOOTSTRAP_SEEDS, interval_kind, mean_interval
 
 PAPER_SETTINGS = {  # Paper, Table 2, in its order, as LaTeX; the optimiser, Adam, is the last
     "actor_learning_rate": "Actor Learning Rate",
@@ -39,7 +40,8 @@ OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is na
     "centre_advantages": "Centred Advantages",
 }
 
-DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit
+DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
+INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
 COLUMNS_PER_BLOCK = 3  # environments, or variants, side by side; more continue below
 
 _LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
@@ -116,6 +118,22 @@ def companions(settings: MetricsConfig) -> list[Metric]:
     return [metric for metric in all_metrics(settings) if metric.name not in PAPER_METRICS]
 
 
+def digits_by_metric(table: pd.DataFrame, settings: MetricsConfig) -> dict[tuple[str, str], int]:
+    """How many digits after the point a `summary` is shown with, by environment and metric.
+
+    Of returns as many as give the largest mean three digits: some environments' are all below 1.
+    """
+    units = {metric.name: metric.unit for metric in all_metrics(settings)}
+    found = {}
+    for (environment, metric), rows in table.groupby(["env", "metric"], sort=False):
+        unit, largest = units[str(metric)], rows["mean"].abs().max()
+        digits = DIGITS[unit]
+        if unit == "return" and largest > 0:
+            digits = max(digits, 2 - math.floor(math.log10(largest)))
+        found[str(environment), str(metric)] = digits
+    return found
+
+
 def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig) -> str:
     """Table 1 in the paper's layout from `table1`: sample efficiency / convergence steps.
 
@@ -134,7 +152,8 @@ def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: Metri
         rows = [cells[environment, variant, metric] for metric in PAPER_METRICS]
         bars = [best.get((environment, metric)) for metric in PAPER_METRICS]
         means = [
-            _mean(row, best=_number(row.mean) == bar) for row, bar in zip(rows, bars, strict=True)
+            _mean(row, best=row.censored < row.seeds and _number(row.mean) == bar)
+            for row, bar in zip(rows, bars, strict=True)
         ]
         intervals = "/".join(map(_interval, rows))
         return _stack(" / ".join(means), rf"{{\scriptsize {intervals}}}")
@@ -163,10 +182,10 @@ def supplement_latex(
     table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig
 ) -> str:
     """The companion metrics from `supplement`: a table per environment, its columns variants."""
-    cells = _cells(table)
+    cells, shown = _cells(table), digits_by_metric(table, settings)
 
     def cell(environment: str, variant: str, metric: Metric) -> str:
-        row, digits = cells[environment, variant, metric.name], DIGITS[metric.unit]
+        row, digits = cells[environment, variant, metric.name], shown[environment, metric.name]
         return _stack(_mean(row, digits), rf"{{\scriptsize {_interval(row, digits)}}}")
 
     floats = []
@@ -276,7 +295,7 @@ def _cells(table: pd.DataFrame) -> dict[tuple[str, str, str], Any]:
 
 
 def _number(value: float, digits: int = 0) -> str:
-    return f"{value:.{digits}f}".replace("-", "$-$")
+    return f"{value:z.{digits}f}".replace("-", "$-$")
 
 
 def _mean(row: Any, digits: int = 0, best: bool = False) -> str:
@@ -294,8 +313,7 @@ def _interval(row: Any, digits: int = 0) -> str:
 
 def _how(table: pd.DataFrame, confidence: float) -> str:
     """The part of a caption that says from what the numbers come."""
-    seeds = table["seeds"].min()
-    count = from_to(table["seeds"])
+    seeds = sorted(table["seeds"].unique())
     budgets: dict[str, list[str]] = {}
     for environment, group in table.groupby("env", sort=False):
         budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
@@ -305,12 +323,16 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
         for episodes, environments in budgets.items()
     )
     level = latex(f"{100 * confidence:g}")
-    kind = {"t": "$t$"}.get(interval_kind(seeds), interval_kind(seeds))
-    text = (
-        "One seed, which allows no interval."
-        if seeds == 1
-        else f"Means over {count} seeds and, below, their {level}\\,\\% {kind} intervals."
-    )
+    kinds = dict.fromkeys(INTERVALS[interval_kind(count)] for count in seeds if count > 1)
+    if kinds:
+        kind = f" (below {BOOTSTRAP_SEEDS} seeds) or ".join(kinds)
+        none = "; one seed allows none" if seeds[0] == 1 else ""
+        text = (
+            f"Means over {from_to(table['seeds'])} seeds and, below,"
+            f" their {level}\\,\\% {kind} intervals{none}."
+        )
+    else:
+        text = "One seed, which allows no interval."
     text += f" Training budget: {budget}."
     if table["censored"].any():
         text += (

@@ -86,7 +86,9 @@ def read(run: Path) -> dict[str, Table]:
     tables: dict[str, Table] = {}
     for name, (prefix, _) in TABLES.items():
         path = run / name
-        if path.exists() and file_digest(path) != digests[name]:
+        if name == files.EPISODES and not path.exists():
+            raise RecordError(f"{path}: the file is missing")
+        if path.exists() and file_digest(path) != digests.get(name):
             raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
         if path.exists():
             frame = pd.read_csv(path)
