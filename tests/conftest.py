@@ -129,8 +129,14 @@ def completes(tmp_path):
 
 
 @pytest.fixture
-def interrupted(run_config, tmp_path, kill, checkpoint_every):
-    """A run of CartPole-v1, killed after a checkpoint: its configuration and folder."""
+def interrupted(run_config, tmp_path, kill, checkpoint_every, monkeypatch):
+    """A run of CartPole-v1, killed after a checkpoint: its configuration and folder.
+
+    It has told its progress once, after the first episode, however slow the machine is.
+    """
+    from mace_rl.runs import run
+
+    monkeypatch.setattr(run, "PROGRESS_SECONDS", 1e9)
     config = run_config("CartPole-v1", "mace_full", 0, episodes=6)
     checkpoint_every(1)
     kill(5, config, tmp_path / "run")

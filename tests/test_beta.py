@@ -85,6 +85,21 @@ def test_sequence_is_state_action_reward_bonus(make):
     np.testing.assert_allclose(found, rows, rtol=1e-5)
 
 
+def test_what_is_far_from_all_that_was_seen_does_not_flood_the_lstm(make):
+    controller, rng = make(), np.random.default_rng(0)
+    controller.normaliser.update(rng.standard_normal((50, 4)))
+    episode = episode_of(rng, length=6)
+    episode.observations[2] = [1e6, -1e6, 0, 0]
+    found = controller.sequence(episode, np.zeros(6), 0.4)[2, :2]
+    assert found.tolist() == [10, -10]
+
+
+def test_one_credit_counts_for_no_more_than_the_bound(make):
+    controller = make(max_credit=2.5, horizon=4)
+    for credit, expected in ((3.0, 1.5), (-3.0, -1.5), (4.9, 2.45), (100.0, 2.5), (-100.0, -2.5)):
+        assert controller.bounded(credit) == expected  # of four terms, whose noise is 2
+
+
 @pytest.mark.parametrize("length", [5, 6, 7, 13, 60])
 def test_long_sequences_are_condensed(make, length):
     """At most 6 stretches of consecutive steps, as even as can be, none left out: mean state and

@@ -76,6 +76,21 @@ def test_rnd_falls_where_it_was_and_stays_high_elsewhere(engine):
     assert (rnd.target.parameters == target).all()
 
 
+@pytest.mark.parametrize("kind", ["rnd", "icm"])
+def test_an_episode_is_learned_once_in_minibatches_in_random_order(kind, monkeypatch):
+    """Whitened with itself among what was seen, every step in one minibatch of at most 20."""
+    bonus, parts = make(kind, batch_size=20), []
+    bonus.remember(wander(0, scale=3.0), np.zeros(50))
+    gradient = bonus.gradient
+    monkeypatch.setattr(bonus, "gradient", lambda part: (parts.append(part), gradient(part))[1])
+    episode, order = wander(1, centre=2.0), copy.deepcopy(bonus.generator).permutation(50)
+    bonus.remember(episode, np.zeros(50))
+    assert [len(part) for part in parts] == [17, 17, 16]
+    seen = np.concatenate([wander(0, scale=3.0).observations[1:], episode.observations[1:]])
+    np.testing.assert_allclose(bonus.normaliser.mean, seen.mean(0), atol=1e-5)
+    np.testing.assert_array_equal(np.concatenate(parts), bonus.inputs(episode)[order])
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_rnd_by_autograd(engine):
     """The bonus and the gradient, from the two networks as torch modules in float64."""

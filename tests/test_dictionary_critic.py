@@ -112,14 +112,21 @@ def test_values_equal_a_search_entry_by_entry(make_ppo, monkeypatch, capacity, n
 def test_the_least_recently_used_state_is_overwritten(make_ppo):
     settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
     critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
-    a, b, c, d, e = np.eye(5, 4, dtype=np.float32)
+    a, b, c, d = np.eye(4, dtype=np.float32)
     for state, value in ((a, 1), (b, 2), (c, 3)):
         critic.remember(batch_of(state[None], [value]))
     assert critic.values(a[None]) == 1  # read: b is now the oldest
     critic.remember(batch_of(d[None], [4]))
     assert (critic.values(np.stack([a, c, d])) == [1, 3, 4]).all() and len(critic) == 3
     assert critic.values(b[None]) != 2
-    critic.remember(batch_of(np.stack([a, b, c, d, e]), [5, 5, 5, 5, 5]))  # more than fit
+
+
+def test_of_more_new_states_than_fit_the_last_are_kept(make_ppo):
+    settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
+    critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
+    states = np.eye(5, 4, dtype=np.float32)[[4, 2, 0, 3, 1]]
+    critic.remember(batch_of(states, [1, 2, 3, 4, 5]))
+    assert (critic.values(states[2:]) == [3, 4, 5]).all() and len(critic) == 3
 
 
 def test_one_experience_counts_at_once(make_ppo):

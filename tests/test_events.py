@@ -105,6 +105,7 @@ def test_events_of_a_run_that_is_not_finished(run_config, monkeypatch, tmp_path)
     ("damage", "words"),
     [
         (lambda run: (run / files.EPISODES).write_text("episode\n1\n"), "SHA-256"),
+        (lambda run: (run / files.EPISODES).unlink(), "episodes.csv: the file is missing"),
         (lambda run: (run / files.RECORD).write_text("{"), "not readable"),
         (lambda run: (run / files.RECORD).rename(run / files.CHECKPOINT), "cut off or altered"),
         (lambda run: (run / files.RECORD).unlink(), "no run in it"),

@@ -111,6 +111,15 @@ def test_seeds_of_different_lengths_are_refused():
         data(runs=runs)
 
 
+def test_seeds_that_differ_between_environments_are_said_of_each():
+    runs = frames(("A-v0",), seeds=5) | frames(("B-v1",), seeds=3)
+    layout = FigureConfig(columns=2)
+    figure = draw_figure(*data(runs=runs), RETURN, layout, 0.95, LABELS, COLOURS)
+    assert [axes.get_title() for axes in figure.axes] == ["A-v0 (5 seeds)", "B-v1 (3 seeds)"]
+    (legend,) = figure.legends
+    assert legend.get_title().get_text().startswith("Line: mean over 3 to 5 seeds. Band: ")
+
+
 def test_one_panel_per_environment_shows_the_data():
     curves, _ = data()
     figure = draw()

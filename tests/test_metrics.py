@@ -251,6 +251,11 @@ def test_solved_is_a_share_of_the_last_episodes():
     assert m.solved(run) == 0.75  # 37, 38 and 39 of 36 to 39
 
 
+def test_the_early_return_is_that_of_the_first_tenth():
+    assert m.early_return(curve(np.arange(40.0))) == 1.5  # of 0 to 3
+    assert m.early_return(curve(np.arange(2000.0))) == np.mean(range(200))
+
+
 def test_a_run_shorter_than_the_window_is_censored():
     run = curve(np.full(20, 100.0), 100, 0)
     assert m.sample_efficiency_range(run) == (20, True)

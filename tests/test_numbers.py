@@ -49,7 +49,7 @@ def test_a_number_that_is_not_printed_is_refused_and_mended(
         printed.main()
 
 
-def test_the_study_page_has_no_number_of_its_own() -> None:
+def test_the_study_page_has_no_decimal_or_count_of_its_own() -> None:
     text = printed.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
@@ -125,6 +125,16 @@ def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
     ):
         with pytest.raises(SystemExit, match=reason):
             results.together(tmp_path / "first", "second", *words)
+
+
+def test_a_regret_that_no_constant_has_is_an_empty_cell(tmp_path: Path) -> None:
+    head = "env,variant,best_constant,best_area,variant_area,regret,low,high,seeds\n"
+    rows = "A-v0,full,ppo,1,0.5,0.5,-0.00001,0.75,9\nB-v0,full,ppo,1,0.5,,,,9\n"
+    (tmp_path / "regret.csv").write_text(head + rows)
+    assert results.regret(tmp_path)[2:] == [
+        "| A-v0 | ppo | 1 | 0.5 | 0.5000 (0.0000 to 0.7500) | 9 |",
+        "| B-v0 | ppo | 1 | 0.5 |  | 9 |",
+    ]
 
 
 def test_finals_name_the_worst_seed(tmp_path: Path) -> None:

@@ -89,6 +89,14 @@ def test_the_regret_shows_constants_as_a_line_and_others_beside_it(study: Study)
     assert means["mace_full"] in dots
 
 
+def test_the_regret_of_seeds_that_are_all_equal_can_be_drawn(study: Study) -> None:
+    """A bound of 20 times 0.1 differs from the mean in the last bit."""
+    frame = table_for_scores({"CartPole-v1": 20}).assign(area_under_curve=0.1)
+    regret = RegretConfig(variant="mace_full", constants=["ppo"])
+    figure = pictures.draw_regret(frame, regret, study.metrics, NAMES, COLOURS)
+    assert len(figure.axes[0].collections) == 2
+
+
 def test_a_picture_is_the_same_file_again(study: Study, tmp_path) -> None:
     frame = table_for_scores(SEEDS)
     curves = pictures.profiles(frame, study.metrics)

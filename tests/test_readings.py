@@ -8,6 +8,7 @@ from mace_rl.config.study import Study
 from mace_rl.results import readings as r
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_TABLE1
+from mace_rl.results.statistics import logrank
 
 EPISODES = 400
 
@@ -82,6 +83,51 @@ def test_the_table_names_the_first_first_and_bold_if_that_is_no_chance(
     assert kinds.index("Convergence") == 1 + max(
         place for place, kind in enumerate(kinds) if kind.startswith("Sample")
     )
+
+
+def ordered(means: dict[str, float], p_values: dict[str, float]) -> tuple[list[str], bool]:
+    rows = pd.DataFrame(
+        {
+            "variant": list(means),
+            "mean": list(means.values()),
+            "rank": [1 + sorted(means.values()).index(mean) for mean in means.values()],
+            "p_value": [p_values.get(name, np.nan) for name in means],
+        }
+    )
+    found, sure = r.ranked(rows)
+    return list(found["variant"]), sure
+
+
+def test_first_for_sure_is_who_is_ahead_of_every_other_beyond_chance() -> None:
+    means = {"c": 300.0, "a": 100.0, "b": 101.0}
+    order = ["a", "b", "c"]
+    assert ordered(means, {"b": 0.049, "c": 0.001}) == (order, True)
+    assert ordered(means, {"b": 0.05, "c": 0.001}) == (order, False)  # of one it is not shown
+    assert ordered(means, {}) == (order, False)  # of the paper's there is no test
+    tied = {"c": 300.0, "a": 100.0, "b": 100.0}
+    assert ordered(tied, {"b": 0.001, "c": 0.001}) == (order, False)
+
+
+def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None:
+    """Three of six never do, the others of both variants at the same episodes."""
+    frames = {}
+    for seed in range(6):
+        for variant in ("ppo", "mace_full"):
+            returns = np.full(EPISODES, 20.0)
+            if variant == "ppo" or seed < 3:
+                returns[100 + seed :] = 450.0
+            frame = pd.DataFrame({"extrinsic_return": returns, "env_steps": np.cumsum(returns)})
+            frames["CartPole-v1", variant, seed] = frame
+    rows = select(r.readings(frames, study.metrics), "sample_efficiency_range", r.RUNS)
+    assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
+    runs = metrics_table(frames, list(frames), study.metrics).set_index("variant")
+    times = {name: runs.loc[name, "sample_efficiency_range"].to_numpy(float) for name in rows.index}
+    times["mace_full"][3:] = np.inf
+    expected = logrank(times["ppo"], times["mace_full"], 9999, np.random.default_rng(0))
+    assert rows.loc["mace_full", "p_value"] == pytest.approx(expected)
+    assert rows.loc["mace_full", "mean"] == (sum(times["ppo"][:3]) + 3 * EPISODES) / 6
+    cells = r.markdown(rows.reset_index(), study.metrics).splitlines()[2]
+    assert "ppo" in cells and f"mace_full {rows.loc['mace_full', 'mean']:.0f}†" in cells
 
 
 def test_an_environment_that_the_paper_has_not(frames, study: Study) -> None:

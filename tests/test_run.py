@@ -20,7 +20,7 @@ from shared import ENVIRONMENTS, LAYER_NORM, OUTCOME, RESULTS, files, finish, pr
 from mace_rl import sources
 from mace_rl.config.reading import merge
 from mace_rl.environments import hopper
-from mace_rl.runs import run
+from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.evaluate import evaluate
 from mace_rl.runs.finished import read_runs
@@ -106,6 +106,34 @@ def test_run_json_says_where_the_results_come_from(finished):
     }
 
 
+def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
+    assert provenance.git_state() == {"commit": None, "dirty": None}
+    git("init")
+    (tmp_path / "code.py").write_text("1\n")
+    git("add", "code.py")
+    git("commit", "-m", "one")
+    (tmp_path / "notes").touch()  # not tracked
+    clean = {"commit": git("rev-parse", "HEAD"), "dirty": False}
+    assert provenance.git_state() == clean
+    (tmp_path / "code.py").write_text("2\n")
+    assert provenance.git_state() == clean | {"dirty": True}
+
+
+def test_seconds_before_an_interruption_count(interrupted):
+    path = interrupted.directory / "checkpoint.pt"
+    state = checkpoint.read(path)["state"] | {"seconds": 1000.0, "checkpoint_seconds": 100.0}
+    checkpoint.save(path, run.run_identity(interrupted.config), state)
+    run.run(interrupted.config, interrupted.directory)
+    found = provenance_of(interrupted.directory)
+    assert len(found["interruptions"]) == 1
+    assert 1000 < found["seconds"] < 1600 and 100 <= found["checkpoint_seconds"] < 200
+
+
 @pytest.mark.parametrize(
     ("environment", "changes", "reason"),
     [
@@ -138,7 +166,7 @@ def test_of_a_fast_path_that_is_taken_not_wanted_or_not_there_nothing_is_said(
 
 def test_progress_says_how_far_it_is(interrupted):
     progress = json.loads((interrupted.directory / "progress.json").read_text())
-    assert (progress["episode"], progress["episodes"]) == (1, 6)  # then not for two seconds
+    assert (progress["episode"], progress["episodes"]) == (1, 6)
     assert progress["env_steps"] == progress["recent_return"]  # CartPole pays 1 a step
     assert progress["pid"] == os.getpid()
 

@@ -143,7 +143,7 @@ def test_units_do_not_matter(play, change):
 
 
 def shares(trainer: Trainer) -> list[float]:
-    """The bonus's share of the total advantage's variance in each update."""
+    """The bonus's share of the squares of both parts of the advantages, in each update."""
     return [row.bonus_share for row in trainer.diagnostics]
 
 

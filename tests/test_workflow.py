@@ -72,6 +72,7 @@ class Project:
         changes = {"PATH": search, "PYTHONPATH": str(self["src"]), "TERM": "xterm"}
         # As on a node of a cluster, which inherits it from the machine that submitted.
         changes["MACE_RL_SNAKEMAKE_PID"] = str(2**22 + 1)  # more than Linux has
+        changes["MACE_RL_CHECKPOINT_SECONDS"] = "0"  # so that there is always one to resume
         environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | changes
         return subprocess.Popen(
             shlex.split(command),
@@ -121,6 +122,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Project:
     code, output = project("snakemake -j2 all")
     assert code == 0, output
     project["file.log"].write_text(output, encoding="utf-8")
+    full = [log.read_text() for log in sorted(project[".snakemake/log"].glob("*.snakemake.log"))]
+    project["first.log"].write_text(full[0], encoding="utf-8")
+    cores = [re.search(r"Provided cores: (\d+)", text)[1] for text in full]
+    assert cores == [str(len(os.sched_getaffinity(0))), "2"]  # without -j, and with
     return project
 
 
@@ -153,10 +158,7 @@ def test_everything_is_made_and_the_terminal_says_how_far_it_is(finished: Projec
     assert len(logs) == len(RUNS) + sum(EVALUATION.values()) + 1  # Table 2
     assert all(": done in" in log.read_text() for log in logs)
     assert len([*finished["results/benchmarks"].rglob("*.tsv")]) == len(RUNS)
-    full = [log.read_text() for log in sorted(finished[".snakemake/log"].glob("*.snakemake.log"))]
-    cores = [re.search(r"Provided cores: (\d+)", text)[1] for text in full]
-    assert cores == [str(len(os.sched_getaffinity(0))), "2"]  # without -j, and with
-    assert "rule train:" in full[0]
+    assert "rule train:" in finished["first.log"].read_text()
 
 
 def test_time_stamps_do_not_count(finished: Project) -> None:
@@ -298,15 +300,17 @@ def test_success_removes_the_checkpoints_of_finished_runs_alone(finished: Projec
 
 def test_the_same_command_after_ctrl_c_and_after_a_kill(finished: Project) -> None:
     command = (
-        "snakemake all --config results=killed environments=[Acrobot-v1] variants=[mace_full]"
-        " 'training={episodes: 300}'"
+        "snakemake all --config results={} environments=[Acrobot-v1] variants=[mace_full]"
+        " 'training={{episodes: 300}}'"
     )
-    told = finished["killed/runs/Acrobot-v1/mace_full/seed0/progress.json"]
+    whole, command = command.format("whole"), command.format("killed")
+    run = finished["killed/runs/Acrobot-v1/mace_full/seed0"]
+    told = run / "progress.json"
     for sent in (signal.SIGINT, signal.SIGKILL):
         with finished["killed.log"].open("w") as log:
             process = finished.start(command, log.fileno())
         deadline = time.monotonic() + 200
-        while not told.exists():
+        while not (told.exists() and (run / "checkpoint.pt").exists()):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)
         training = json.loads(told.read_text())["pid"]
@@ -326,14 +330,18 @@ def test_the_same_command_after_ctrl_c_and_after_a_kill(finished: Project) -> No
     assert "] 1 of 1 runs done\n" in output
     assert not Path(f"/proc/{training}").exists()  # the killed Snakemake's training has ended
     assert "Nothing to be done" in finished(f"{command} -n")[1]
+    record = json.loads((run / "run.json").read_text())
+    assert len(record["interruptions"]) == 2
+    code, output = finished(whole)
+    assert code == 0, output
+    undisturbed = finished["whole/runs/Acrobot-v1/mace_full/seed0"]
+    for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):
+        assert (run / name).read_bytes() == (undisturbed / name).read_bytes()
 
 
 def test_planning_three_thousand_runs(tmp_path: Path) -> None:
     project = Project(tmp_path, environments=["CartPole-v1"], seeds=list(range(1000)))
-    start = time.monotonic()
-    jobs = project.planned()
-    print(f"planning 3,000 runs took {time.monotonic() - start:.1f} s")
-    assert jobs == {"train": 3000, "table2": 1, **EVALUATION}
+    assert project.planned() == {"train": 3000, "table2": 1, **EVALUATION}
 
 
 @pytest.mark.slow
