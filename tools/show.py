@@ -3,7 +3,8 @@
     .venv/bin/python -m tools.show WHAT FOLDER [...]
 
 FOLDER is one of reference/tables, or the results of any study; of the last five reference/study
-and reference/measured. WHAT is one of
+and reference/measured. Intervals and what is computed of kept runs are as `metrics` of config.yaml
+has it, also where a study's own files had other settings. WHAT is one of
 
     headline    what holds, in three sentences                                      (claims.json)
     ledger      a verdict for each claim                                           (claims.json)
