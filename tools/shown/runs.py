@@ -18,7 +18,9 @@ from tools.shown.cells import SETTINGS, mean, number
 def betas(folder: Path, *environments: str) -> list[str]:
     """The mean β of the last part of the episodes, of each seed, in order of size."""
     part = SETTINGS.final_fraction
-    return _of_each_seed(folder, environments, "β at the end", lambda beta: final_return(beta, part))
+    return _of_each_seed(
+        folder, environments, "β at the end", lambda beta: final_return(beta, part)
+    )
 
 
 def lowest(folder: Path, *environments: str) -> list[str]:
