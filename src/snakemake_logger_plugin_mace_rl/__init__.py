@@ -37,6 +37,8 @@ ROUTINE_TEXT = re.compile(
     r"^Cleaning up SLURM log files"
 )
 SILENT = "it ended without a word"
+# What workflow/scripts/job.py writes into a job's log first and last.
+STARTED = re.compile(r": started as process \d+$", re.MULTILINE)
 DONE = re.compile(r": done in [\d.]+ s$", re.MULTILINE)
 
 
@@ -58,7 +60,6 @@ class Study:
         self.waiting = {key: self.runs[key] for key in due}
         self.begun: dict[Run, Pace] = {}  # or handed to a queue
         self.ended: dict[Run, str] = {}  # done, failed or interrupted
-        self.attempts: Counter[Run] = Counter()
         self.cores, self.retries = cores, retries
         self.finished = {r: seconds for r in self.runs.values() if (seconds := r.seconds())}
         self.starts = [5.0]  # seconds of jobs beside the training; the first is a guess
@@ -69,7 +70,6 @@ class Study:
         """Its job was started or handed to a queue."""
         self.waiting.pop(run[:3], None)
         self.ended.pop(run, None)
-        self.attempts[run] += 1
         self.begun[run] = Pace(stale=run.read(files.PROGRESS))
 
     def ends(self, run: Run, how: str) -> None:
@@ -126,13 +126,21 @@ class Study:
 class LogHandler(LogHandlerBase):
     """Shows errors and what Snakemake says of the whole, and below it the runs that train."""
 
-    writes_to_stream = True
-    writes_to_file = has_filter = has_formatter = needs_rulegraph = False
+    # The filter is for what is shown: what becomes of a job has to be known in any case.
+    writes_to_stream = has_filter = True
+    writes_to_file = has_formatter = needs_rulegraph = False
 
     def __post_init__(self) -> None:
-        self.display = Display(sys.stdout if self.common_settings.stdout else sys.stderr)
+        from snakemake.logging import DefaultFilter
+
+        settings = self.common_settings
+        self.display = Display(sys.stdout if settings.stdout else sys.stderr, settings.nocolor)
+        names = ("quiet", "debug_dag", "verbose", "dryrun", "printshellcmds")
+        self.asked_for = DefaultFilter(**{name: getattr(settings, name) for name in names}).filter
+        self.quiet = {choice.name for choice in settings.quiet or ()}
         self.study = Study([], [], None)
         self.jobs: dict[int, Any] = {}
+        self.attempts: Counter[int] = Counter()  # of each job
         self.blamed: dict[int, str | None] = {}  # of jobs that shared an entry of a queue
         self.closed = threading.Event()
         self.refreshing = threading.Thread(target=self.refresh, daemon=True)
@@ -152,6 +160,7 @@ class LogHandler(LogHandlerBase):
         event = getattr(record, "event", None)
         if event == LogEvent.JOB_INFO:
             self.jobs[record.jobid] = record
+            self.attempts[record.jobid] += 1
             if run := self.run_of(record):
                 self.study.begins(run)
         elif event == LogEvent.GROUP_ERROR:
@@ -167,17 +176,25 @@ class LogHandler(LogHandlerBase):
                 well = "done" if event == LogEvent.JOB_FINISHED else "interrupted"
                 self.study.ends(run, "failed" if why else well)
             if why:
-                self.display.print(why + self.again([job]), "red")
+                self.complain(why + self.again([job]), [Path(log) for log in job.log])
         elif hasattr(record, "study"):
             self.study = record.study
-            quiet = {choice.name for choice in self.common_settings.quiet or ()}
-            if self.study.waiting and not quiet & {"ALL", "PROGRESS", "RULES"}:
+            if self.study.waiting and not self.quiet & {"ALL", "PROGRESS", "RULES"}:
                 self.refreshing.start()
         routine = event in ROUTINE or ROUTINE_TEXT.search(str(record.msg))
-        if self.common_settings.dryrun or not routine:
+        if self.asked_for(record) and (self.common_settings.dryrun or not routine):
             colour = {"WARNING": "yellow", "ERROR": "red"}.get(record.levelname)
             gap = "\n" if event == LogEvent.JOB_INFO else ""
             self.display.print(gap + self.format(record), colour)
+
+    def complain(self, text: str, logs: Iterable[Path]) -> None:
+        """Say why something failed; with --show-failed-logs also what is in its `logs`."""
+        if "ALL" in self.quiet:
+            return
+        self.display.print(text, "red")
+        if self.common_settings.show_failed_logs:
+            for log in filter(Path.exists, logs):
+                self.display.print(f"{log}:\n{log.read_text(errors='replace').rstrip()}")
 
     def blame(self, jobs: list[Any], entry: list[Path]) -> None:
         """Find out which of `jobs` are why their entry of a queue failed, by its log and theirs."""
@@ -185,13 +202,12 @@ class LogHandler(LogHandlerBase):
         self.blamed = {job.jobid: None if word else own_reason(job) for job in jobs}
         if not any(self.blamed.values()):
             runs = f"{len(jobs)} runs in one entry of the queue" if jobs[1:] else name(jobs[0])
-            text = f"{runs} failed: {word or SILENT}{more(entry)}{self.again(jobs)}"
-            self.display.print(text, "red")
+            self.complain(f"{runs} failed: {word or SILENT}{more(entry)}{self.again(jobs)}", entry)
 
     def again(self, jobs: list[Any]) -> str:
         """Whether Snakemake tries them again, in words."""
-        attempts = [self.study.attempts[run] for job in jobs if (run := self.run_of(job))]
-        return "; tried again" if attempts and max(attempts) <= self.study.retries else ""
+        attempts = max(self.attempts[job.jobid] for job in jobs)
+        return "; tried again" if attempts <= self.study.retries else ""
 
     def run_of(self, job: Any) -> Run | None:
         """The run of the study that a job trains; None if it does something else."""
@@ -224,13 +240,20 @@ class LogHandler(LogHandlerBase):
 def reason(job: Any, entry: Sequence[Path] = ()) -> str | None:
     """Why a job failed, by its log or its `entry`'s in a queue; None if it was interrupted."""
     log = Path(job.log[0])
-    for line in reversed(log.read_text(errors="replace").splitlines() if log.exists() else []):
+    for line in reversed(last_attempt(log).splitlines()):
         if line.endswith(": interrupted"):
             return None
         if " failed: " in line:
             return line.split(" ", 2)[2] + more([log])
     word = slurms_word(entry)
     return f"{name(job)} failed: {word or SILENT}{more(entry if word else [log])}"
+
+
+def last_attempt(log: Path) -> str:
+    """What the last process of a job wrote into its log, to which each of them appends."""
+    text = log.read_text(errors="replace") if log.exists() else ""
+    beginnings = list(STARTED.finditer(text))
+    return text[beginnings[-1].start() :] if beginnings else text
 
 
 def name(job: Any) -> str:
@@ -243,7 +266,7 @@ def own_reason(job: Any) -> str | None:
     log = Path(job.log[0])
     if not log.exists() or log.stat().st_mtime < job.created:  # it is of an earlier attempt
         return None
-    return None if DONE.search(log.read_text(errors="replace")) else reason(job)
+    return None if DONE.search(last_attempt(log)) else reason(job)
 
 
 def slurms_word(entry: Iterable[Path]) -> str | None:

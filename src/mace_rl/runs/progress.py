@@ -173,12 +173,13 @@ def duration(seconds: float) -> str:
 class Display:
     """Shows the newest of what it is given: in place on a terminal, else as lines now and then."""
 
-    def __init__(self, file: TextIO) -> None:
+    def __init__(self, file: TextIO, no_color: bool = False) -> None:
         from rich.console import Console
         from rich.live import Live
 
         # A file is as wide as the lines are.
-        self.console = Console(file=file, highlight=False, width=None if file.isatty() else 120)
+        width = None if file.isatty() else 120
+        self.console = Console(file=file, highlight=False, width=width, no_color=no_color or None)
         self.in_place = file.isatty() and not self.console.is_dumb_terminal
         self.live = Live(console=self.console, auto_refresh=False, transient=True)
         self.next = time.monotonic() + FIRST_SECONDS
