@@ -47,6 +47,12 @@ def test_a_number_that_is_not_printed_is_refused_and_mended(
     page.write_text("<!-- python -m tools.show means reference/none -->\n<!-- end -->")
     with pytest.raises(SystemExit, match="reference/none"):
         printed.main()
+    mark = "<!-- python -m tools.show means reference/tables/baseline -->"
+    for text in (f"{mark}\nwords\n{mark}\n<!-- end -->\n", f"{mark}\n", f"{mark} 9\n<!-- end -->"):
+        page.write_text(text)
+        with pytest.raises(SystemExit, match=r"README\.md: a mark has no text with an end"):
+            printed.main()
+        assert page.read_text() == text
 
 
 def test_the_study_page_has_no_decimal_or_count_of_its_own() -> None:

@@ -43,6 +43,13 @@ class NoDisplay(CartPoleEnv):
         raise OSError("no display")
 
 
+class NoMode(CartPoleEnv):
+    """One whose metadata promise more than its constructor takes."""
+
+    def __init__(self):
+        super().__init__()
+
+
 @pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0"])
 def test_what_is_filmed_is_what_evaluate_plays(finished, environment):
     folder = finished(environment)
@@ -88,6 +95,19 @@ def test_pictures_and_speed_are_the_environments_own(finished):
     assert film.returns == evaluate(folder, 1, 0).tolist()
 
 
+def test_a_film_is_as_fast_as_its_environment(finished):
+    """Acrobot's 15 steps a second are no whole number of a GIF's hundredths of a second."""
+    film = watch.film(finished("Acrobot-v1"), seconds=3.0)
+    with Image.open(io.BytesIO(watch.gif(film))) as image:
+        shown = []
+        for place in range(image.n_frames):
+            image.seek(place)
+            shown.append(image.info["duration"])
+    assert shown == film.milliseconds and set(shown[:-1]) == {60, 70}
+    starts = np.cumsum([0, *shown[:-1]])
+    np.testing.assert_allclose(starts, np.arange(46) * 1000 / 15, atol=5)
+
+
 def test_a_film_is_written_whole(finished):
     film = watch.film(finished("CartPole-v1"), width=120)
     data = watch.gif(film)
@@ -106,6 +126,11 @@ def test_what_cannot_be_filmed_is_said(finished, tmp_path, register):
         watch.film(finished("PlantedHelp-v0"))
     name = register("NoDisplay-v0", NoDisplay)
     with pytest.raises(ConfigError, match="'NoDisplay-v0' cannot be drawn: OSError: no display"):
+        watch.film(finished(name))
+    name = register("NoMode-v0", NoMode)
+    with pytest.raises(
+        watch.RenderError, match=r"'NoMode-v0' with .* cannot be drawn"
+    ):
         watch.film(finished(name))
     for name in (files.RECORD, files.EPISODES):
         (tmp_path / name).write_bytes((finished("CartPole-v1") / name).read_bytes())

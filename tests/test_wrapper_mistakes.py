@@ -46,6 +46,8 @@ def test_defaults_are_the_study_s():
         ({"novelty": {"neighbours": [9000]}}, "neighbours has 9000, which must be less than"),
         ({"discount": 1.1}, "discount is 1.1, but .* less than or equal to 1"),
         ({"seed": -1}, "seed is -1, but .* greater than or equal to 0"),
+        ({"seed": None}, "seed is None, but should be an? .*integer"),
+        ({"discount": None}, "discount is None, but should be a .*number"),
         ({"rollout_steps": 0}, "rollout_steps is 0, but .* greater than 0"),
     ],
 )

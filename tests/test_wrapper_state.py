@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import FlattenObservation
 from wrapped import BANDIT, ENVIRONMENTS, MODES, RANDOM, SMALL, play, play_vector, step, vector_of
 
 import mace_rl.environments  # noqa: F401  (registers ours)
@@ -79,6 +80,13 @@ def test_a_state_made_with_other_settings_is_refused():
     two = VectorCuriosityReward(vector_of("CartPole-v1", 2, AutoresetMode.NEXT_STEP))
     with pytest.raises(ConfigError, match="made with environments 1, but here it is 2"):
         two.load_state_dict(state)
+    discrete = CuriosityReward(gymnasium.make("FrozenLake-v1")).state_dict()
+    box = FlattenObservation(gymnasium.make("FrozenLake-v1"))
+    with pytest.raises(ConfigError, match="made with observation_space 'Discrete', but here it is"):
+        CuriosityReward(box).load_state_dict(discrete)
+    del discrete["settings"]["beta"]
+    with pytest.raises(ConfigError, match="does not say which beta it is of"):
+        CuriosityReward(gymnasium.make("FrozenLake-v1"), 0.9).load_state_dict(discrete)
     state["settings"]["curves"] = 3  # as a later version could have it
     with pytest.raises(ConfigError, match="made with curves 3, which is no setting here"):
         CuriosityReward(gymnasium.make("CartPole-v1")).load_state_dict(state)

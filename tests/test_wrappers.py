@@ -274,14 +274,11 @@ def test_a_novelty_of_the_user_s_own_is_asked_for_every_state():
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "DeepSea10-v0"])
 @pytest.mark.parametrize("played", [0, 450])
 def test_checkers_pass(name, played):
-    """Rendering is left out, as it takes pygame, which this project does not install.
-
-    The warnings let through are about the environment's own spaces, and that it is wrapped.
-    """
+    """The warnings let through are about the environment's own spaces, and that it is wrapped."""
     env = CuriosityReward(gymnasium.make(name))
     if played:
         play(env, played)
-    check_env(env, skip_render_check=True)
+    check_env(env)
     sb3_check_env(env)
 
 

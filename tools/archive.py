@@ -11,6 +11,7 @@ equal runs give equal files. `make tables` reads what is in reference/study.
 
 import argparse
 import io
+import json
 import lzma
 import os
 import sys
@@ -49,8 +50,8 @@ def write(archive: Path, content: dict[str, bytes]) -> None:
 def pack(results: Path, archives: Path) -> int:
     """Add the finished runs of `results` to `archives`; returns how many there are now.
 
-    Raises `ValueError` if there are none in `results`, or if a run's records are not those that its
-    `run.json` describes.
+    Raises `ValueError` if there are none in `results`, if a run's records are not those that its
+    `run.json` describes, or if another run of the same seed is kept.
     """
     if not any(results.glob(f"runs/*/*/seed*/{files.RECORD}")):
         raise ValueError(f"{results}: no runs/ENV/VARIANT/seedN/{files.RECORD} in it")
@@ -63,6 +64,9 @@ def pack(results: Path, archives: Path) -> int:
             if not (run / files.RECORD).exists():
                 continue  # not finished
             digests = read_record(run / files.RECORD)["outputs"]
+            before = packed.get(f"{run.name}/{files.RECORD}")
+            if before and json.loads(before)["outputs"] != digests:
+                raise ValueError(f"{run}: {archive} has another run of this seed")
             kept = [files.EPISODES, *([files.AGENT] if run.name == AT_PLAY else [])]
             for name in kept:
                 if file_digest(run / name) != digests[name]:

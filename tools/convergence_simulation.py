@@ -182,7 +182,10 @@ def main() -> None:
     real: dict[str, list[str]] = {}
     try:
         for folder in folders:
-            real |= real_columns(folder)
+            columns = real_columns(folder)
+            if both := real.keys() & columns.keys():
+                raise ConfigError(f"{folder}: another folder has {min(both)} too")
+            real |= columns
     except ConfigError as error:
         sys.exit(f"convergence_simulation: {error}")
     columns = {shape: column(shape) for shape in SHAPES} | real

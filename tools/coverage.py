@@ -8,6 +8,7 @@ the probability of improvement over a variant of the same distribution (truth: o
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -70,4 +71,7 @@ if __name__ == "__main__":
         description=__doc__.splitlines()[0], epilog="example: python -m tools.coverage 500"
     )
     parser.add_argument("repeats", type=int, nargs="?", default=2000, help="(default: 2000)")
-    main(parser.parse_args().repeats)
+    count = parser.parse_args().repeats
+    if count < 1:
+        sys.exit(f"coverage: REPEATS is {count}, but should be at least 1")
+    main(count)

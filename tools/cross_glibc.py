@@ -39,8 +39,13 @@ def version(start: list[str]) -> str:
     code = "import os; print(os.confstr('CS_GNU_LIBC_VERSION'))"
     found = subprocess.run([*start, "-c", code], capture_output=True, text=True)
     if found.returncode:
-        sys.exit(f"cross-glibc: {' '.join(start[:1])}: {found.stderr.strip().splitlines()[-1]}")
+        sys.exit(f"cross-glibc: {' '.join(start[:1])}: {last_line(found)}")
     return found.stdout.strip()
+
+
+def last_line(said: subprocess.CompletedProcess[str]) -> str:
+    """What a process that failed said last, or how it ended."""
+    return (said.stderr.strip().splitlines() or [f"it ended with {said.returncode}"])[-1]
 
 
 def train(start: list[str], environment: str, folder: Path) -> dict[str, bytes]:
@@ -49,7 +54,7 @@ def train(start: list[str], environment: str, folder: Path) -> dict[str, bytes]:
     command += ["--variant", "mace_full", "--episodes", str(EPISODES[environment])]
     done = subprocess.run([*command, "--out", str(folder)], capture_output=True, text=True)
     if done.returncode:
-        sys.exit(f"cross-glibc: a training failed: {done.stderr.strip().splitlines()[-1]}")
+        sys.exit(f"cross-glibc: a training failed: {last_line(done)}")
     return {name: (folder / name).read_bytes() for name in files.RESULTS}
 
 

@@ -5,10 +5,12 @@
 Every environment and variant of the paper is trained once undisturbed. Then, for each, a training
 is killed (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its
 results, and the same command is given again. At last a small workflow gets SIGINT, SIGTERM and
-SIGKILL. What is there in the end has to equal the undisturbed run byte for byte, with nothing left.
+SIGKILL. What had a checkpoint has to be resumed, and what is there in the end has to equal the
+undisturbed run byte for byte, with nothing left.
 """
 
 import argparse
+import json
 import os
 import random
 import signal
@@ -24,12 +26,15 @@ from typing import Any
 
 from mace_rl import files
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
+from tools.slurm_test import contents
 
 ROOT = Path(__file__).resolve().parent.parent
 EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
 # Checkpoints as fast as they can be written: the moments to hit are then all through the training.
-TRAIN = "import mace_rl.runs.run as r; r.CHECKPOINT_SECONDS = 0.05; r.CHECKPOINT_COST = 1.0; "
-TRAIN += "from mace_rl.cli import main; main()"
+TRAIN = (
+    "import mace_rl.runs.run as r; r.CHECKPOINT_COST = 1.0; from mace_rl.cli import main; main()"
+)
+OFTEN = {"MACE_RL_CHECKPOINT_SECONDS": "0.05"}
 RESULTS = {*files.RESULTS, files.RECORD}
 
 
@@ -38,7 +43,7 @@ def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[byte
     command = [sys.executable, "-c", TRAIN, "train", "--env", environment, "--variant", variant]
     command += ["--seed", "0", "--episodes", str(EPISODES[environment]), "--out", str(folder)]
     return subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | OFTEN
     )
 
 
@@ -46,7 +51,8 @@ def finish(process: subprocess.Popen[bytes]) -> None:
     """Wait for a training; exit with what it said if it failed."""
     _, error = process.communicate()
     if process.returncode != 0:
-        sys.exit(f"kill test: a training failed: {error.decode().strip().splitlines()[-1]}")
+        said = error.decode().strip().splitlines() or [f"it ended with {process.returncode}"]
+        sys.exit(f"kill test: a training failed: {said[-1]}")
 
 
 def names(folder: Path) -> set[str]:
@@ -94,6 +100,26 @@ def same(folder: Path, undisturbed: Path) -> bool:
     )
 
 
+def cut_off(folder: Path) -> bool:
+    """Whether what is in `folder` has to be resumed: there is a checkpoint, and no end."""
+    return files.CHECKPOINT in names(folder) and files.RECORD not in names(folder)
+
+
+def resumed(folder: Path) -> bool:
+    """Whether the run in `folder` tells of an interruption."""
+    record = folder / files.RECORD
+    return record.exists() and bool(json.loads(record.read_bytes())["interruptions"])
+
+
+def outcome(hit: bool, equal: bool, as_it_should: bool) -> str:
+    """In a word: equal, or what is wrong, at first whether anything was killed at all."""
+    if not hit:
+        return "NOT HIT"
+    if not equal:
+        return "DIFFERENT"
+    return "equal" if as_it_should else "NOT RESUMED"
+
+
 def kill_trainings(scratch: Path, repeats: int, generator: random.Random) -> list[bool]:
     """Kill every environment's and variant's training at every kind of moment."""
     outcomes = []
@@ -115,9 +141,10 @@ def kill_trainings(scratch: Path, repeats: int, generator: random.Random) -> lis
             folder = scratch / f"{environment}-{variant}-{name}-{repeat}"
             process = start(environment, variant, folder)
             killed = kill_when(process, folder, moment, delay())
+            cut = cut_off(folder)
             finish(start(environment, variant, folder))
-            outcomes.append(killed and same(folder, undisturbed))
-            result = "equal" if outcomes[-1] else "DIFFERENT" if killed else "NOT HIT"
+            result = outcome(killed, same(folder, undisturbed), resumed(folder) or not cut)
+            outcomes.append(result == "equal")
             print(f"{environment} {variant}, killed while {name}: {result}", flush=True)
         print(f"  ({time.monotonic() - began:.0f} s)", flush=True)
     return outcomes
@@ -127,7 +154,7 @@ def kill_workflows(scratch: Path) -> list[bool]:
     """Interrupt a small workflow by three signals; each time the same command has to finish it."""
     outcomes = []
     settings = scratch / "small.yaml"
-    tables = {}
+    found: dict[str, dict[str, bytes]] = {}
     for name, sent in [
         ("none", None),
         *((s.name, s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)),
@@ -143,26 +170,28 @@ def kill_workflows(scratch: Path) -> list[bool]:
             "stdout": subprocess.DEVNULL,
             "stderr": subprocess.DEVNULL,
             "cwd": ROOT,
+            "env": os.environ | OFTEN,
         }
+        hit, runs = False, f"runs/*/*/*/{files.CHECKPOINT}"
         if sent:
             process = subprocess.Popen(command, start_new_session=True, **quiet)
-            while process.poll() is None and not list(results.glob(f"runs/*/*/*/{files.PROGRESS}")):
+            while process.poll() is None and not list(results.glob(runs)):
                 time.sleep(0.05)
-            if sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
+            hit = process.poll() is None
+            if hit and sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
                 os.killpg(process.pid, sent)
-            else:
+            elif hit:
                 process.send_signal(sent)
             process.wait()
             time.sleep(3)  # jobs of a killed Snakemake notice and end
+        cut = [path.parent for path in results.glob(runs) if cut_off(path.parent)]
         again = subprocess.run(command, **quiet, check=False)
-        tables[name] = {
-            path.relative_to(results): path.read_bytes()
-            for pattern in (f"runs/*/*/*/{files.EPISODES}", "*.csv", "table1.*")
-            for path in sorted(results.glob(pattern))
-        }
+        found[name] = contents(results)
         if sent:
-            outcomes.append(again.returncode == 0 and tables[name] == tables["none"])
-            print(f"workflow, {name}: {'equal' if outcomes[-1] else 'DIFFERENT'}", flush=True)
+            equal = again.returncode == 0 and found[name] == found["none"]
+            result = outcome(hit and bool(cut), equal, all(map(resumed, cut)))
+            outcomes.append(result == "equal")
+            print(f"workflow, {name}: {result}", flush=True)
     return outcomes
 
 
@@ -174,6 +203,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1, help="kills of each kind (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments (default: 0)")
     arguments = parser.parse_args()
+    if arguments.repeats < 1:
+        sys.exit(f"kill test: --repeats is {arguments.repeats}, but should be at least 1")
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         trainings = kill_trainings(scratch, arguments.repeats, random.Random(arguments.seed))

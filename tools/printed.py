@@ -15,7 +15,9 @@ from pathlib import Path
 from tools.show import SHOWN
 
 ROOT = Path(__file__).resolve().parent.parent
-MARKED = re.compile(r"<!-- python -m tools\.show (.*?) -->\n(.*?)<!-- end -->", re.DOTALL)
+MARK = "<!-- python -m tools.show "
+# The text has no other mark in it: one whose end is missing must not swallow the next.
+MARKED = re.compile(rf"{re.escape(MARK)}([^\n]*?) -->\n((?:(?!<!--).)*?)<!-- end -->", re.DOTALL)
 
 
 def pages() -> Iterator[Path]:
@@ -43,6 +45,10 @@ def main() -> None:
     stale, marks = [], 0
     for page in pages():
         text = page.read_text(encoding="utf-8")
+        if len(MARKED.findall(text)) != text.count(MARK):
+            sys.exit(
+                f"numbers: {page.relative_to(ROOT)}: a mark has no text with an end of its own"
+            )
 
         def renew(mark: re.Match[str], page: Path = page) -> str:
             nonlocal marks
@@ -50,7 +56,7 @@ def main() -> None:
             new = printed(mark[1])
             if new != mark[2]:
                 stale.append(f"{page.relative_to(ROOT)}: {mark[1]}")
-            return f"<!-- python -m tools.show {mark[1]} -->\n{new}<!-- end -->"
+            return f"{MARK}{mark[1]} -->\n{new}<!-- end -->"
 
         renewed = MARKED.sub(renew, text)
         if not check:

@@ -139,8 +139,9 @@ class Appraisal:
     def described(self) -> dict[str, Any]:
         """What a state has to agree in with the one who loads it."""
         described = self.config.model_dump(exclude={"seed"})  # drawn already
-        size = self.spaces.observation_size
-        return {**described, "observation_size": size, "environments": len(self.recordings)}
+        described["observation_size"] = self.spaces.observation_size
+        described["observation_space"] = type(self.spaces.observation_space).__name__
+        return {**described, "environments": len(self.recordings)}
 
     def state_dict(self) -> dict[str, Any]:
         """See `CuriosityReward`."""
@@ -159,6 +160,8 @@ class Appraisal:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `CuriosityReward`."""
         state, mine = copy.deepcopy(state), self.described()
+        if missing := mine.keys() - state["settings"]:
+            raise ConfigError(f"the state to load does not say which {min(missing)} it is of")
         for name, value in state["settings"].items():
             if name not in mine:
                 raise ConfigError(

@@ -70,15 +70,14 @@ class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         rollout_steps: int = 1,
         seed: int = 0,
     ) -> None:
-        settings = given(
-            beta=beta,
-            relevance=relevance,
-            memory=memory,
-            novelty=novelty,
-            discount=discount,
-            rollout_steps=rollout_steps,
-            seed=seed,
-        )
+        settings = {
+            "beta": beta,
+            "relevance": relevance,
+            "discount": discount,
+            "rollout_steps": rollout_steps,
+            "seed": seed,
+            **given(memory=memory, novelty=novelty),
+        }
         RecordConstructorArgs.__init__(self, **settings)  # for `spec`, from which it can be remade
         gymnasium.Wrapper.__init__(self, env)
         config = check(CuriosityConfig, settings, type(self).__name__)
@@ -136,15 +135,14 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
         rollout_steps: int = 1,
         seed: int = 0,
     ) -> None:
-        settings = given(
-            beta=beta,
-            relevance=relevance,
-            memory=memory,
-            novelty=novelty,
-            discount=discount,
-            rollout_steps=rollout_steps,
-            seed=seed,
-        )
+        settings = {
+            "beta": beta,
+            "relevance": relevance,
+            "discount": discount,
+            "rollout_steps": rollout_steps,
+            "seed": seed,
+            **given(memory=memory, novelty=novelty),
+        }
         super().__init__(env)
         self.mode = env.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):

@@ -53,10 +53,11 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.name, self.width = name, width
         per_second = env.metadata.get("render_fps") or MOST_PER_SECOND
         self.stride = math.ceil(per_second / MOST_PER_SECOND)  # steps from picture to picture
-        self.duration = round(1000 * self.stride / per_second)
+        self.duration = 1000 * self.stride / per_second  # milliseconds
         self.last_step = seconds * per_second
         self.font = ImageFont.load_default(12)
         self.film = Film([], [], [])
+        self.begun = 0.0  # when the next picture begins; a GIF has hundredths of a second
 
     def reset(self, **arguments: Any) -> Any:
         """The environment's reset, with the first picture of an episode."""
@@ -91,7 +92,8 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         text = f"step {self.steps}   return {self.extrinsic_return:.1f}"
         ImageDraw.Draw(picture).text((4, height + 2), text, fill="black", font=self.font)
         self.film.pictures.append(picture)
-        self.film.milliseconds.append(self.duration)
+        begun, self.begun = self.begun, self.begun + self.duration
+        self.film.milliseconds.append(10 * (round(self.begun / 10) - round(begun / 10)))
 
 
 def film(
@@ -122,12 +124,15 @@ def film(
             f"environment {config.environment!r} cannot be drawn: 'rgb_array' is not among its"
             " render modes"
         )
-    environment = Environment(
-        config.environment,
-        np.random.SeedSequence(0),
-        config.max_episode_steps,
-        {**config.environment_arguments, "render_mode": "rgb_array"},
-    )
+    try:
+        environment = Environment(
+            config.environment,
+            np.random.SeedSequence(0),
+            config.max_episode_steps,
+            {**config.environment_arguments, "render_mode": "rgb_array"},
+        )
+    except ConfigError as error:  # it trains, so it is the mode that it does not take
+        raise RenderError(f"{error}, so it cannot be drawn") from None
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
     with closing(filmed), nothing_printed():
