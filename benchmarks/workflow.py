@@ -1,7 +1,7 @@
 """What Snakemake, imports and file writing add to training: workflow.csv and planning.csv.
 
 A small study is run for real, with two jobs at a time, in a folder of its own; what it shows is
-extrapolated to the paper's budgets by `report.paper_budget`. A large study is only planned.
+extrapolated to the paper's budgets by `summaries.paper_budget`. A large study is only planned.
 """
 
 import json

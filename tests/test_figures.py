@@ -16,6 +16,7 @@ from matplotlib.colors import same_color
 from mace_rl.config.results import FigureConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import read_study
+from mace_rl.report.panels import MAX_POINTS, _thinned
 from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
 from mace_rl.results.records import RecordError
 
@@ -76,6 +77,15 @@ def test_long_curves_are_thinned_and_end_at_the_last_episode(episodes, points):
     assert set(np.diff(curve["episode"])) == {math.ceil(episodes / 500)}
     full = run["extrinsic_return"].rolling(5, min_periods=1).mean().to_numpy()
     np.testing.assert_allclose(curve["moving_average"], full[curve["episode"] - 1])
+
+
+def test_the_panels_of_the_page_are_thinned_and_end_at_the_last_episode():
+    frame = pd.DataFrame({"episode": np.tile(np.arange(1, 1002), 2), "variant": "ppo"})
+    kept = _thinned(frame)["episode"].to_numpy().reshape(2, -1)
+    step = math.ceil(1001 / MAX_POINTS)
+    assert (kept == np.arange(1001, 0, -step)[::-1]).all()
+    assert len(kept[0]) <= MAX_POINTS
+    assert len(_thinned(frame.head(MAX_POINTS))) == MAX_POINTS
 
 
 def test_mean_curves_against_scipy_point_by_point():

@@ -128,6 +128,33 @@ def test_runs_on_other_machines(tmp_path: Path, handler: LogHandler) -> None:
     handler.close()
 
 
+@pytest.mark.parametrize(("cores", "expected"), [(2, [5.0, 40.0]), (None, [5.0])])
+def test_the_time_beside_the_training_is_known_where_jobs_do_not_wait_in_a_queue(
+    tmp_path: Path, cores: int | None, expected: list[float]
+) -> None:
+    one = A._replace(folder=str(tmp_path))
+    study = Study([one], [one[:3]], cores)
+    study.begins(one)
+    study.begun[one].begun -= 100  # seconds ago
+    record = {"seconds": 70.0, "start_seconds": 10.0, "config": {"episodes": 100}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    study.ends(one, "done")
+    assert study.finished == {one: 60.0}
+    assert study.starts == pytest.approx(expected, abs=1)
+
+
+def test_environments_without_a_finished_run_are_left_out_of_the_time_left(tmp_path: Path) -> None:
+    done, same = (some_run(seed)._replace(folder=str(tmp_path / f"{seed}")) for seed in (0, 1))
+    other = some_run(0, env="Hopper")
+    (tmp_path / "0").mkdir()
+    record = {"seconds": 90.0, "start_seconds": 30.0, "config": {"episodes": 100}}
+    (tmp_path / "0/run.json").write_text(json.dumps(record))
+    study = Study([done, same, other], [same[:3], other[:3]], cores=1)
+    assert shown(study) == ["0 of 2 runs done, 2 waiting; about 1 min 10 s left, without Hopper"]
+    del study.waiting[other[:3]]
+    assert shown(study) == ["0 of 1 runs done, 1 waiting; about 1 min 10 s left"]
+
+
 TIME_LIMIT = "slurmstepd: error: *** JOB 8 ON n1 CANCELLED AT 2026-01-01T12:00:00 DUE TO TIME LIMIT"
 
 

@@ -128,9 +128,7 @@ def test_what_cannot_be_filmed_is_said(finished, tmp_path, register):
     with pytest.raises(ConfigError, match="'NoDisplay-v0' cannot be drawn: OSError: no display"):
         watch.film(finished(name))
     name = register("NoMode-v0", NoMode)
-    with pytest.raises(
-        watch.RenderError, match=r"'NoMode-v0' with .* cannot be drawn"
-    ):
+    with pytest.raises(watch.RenderError, match=r"'NoMode-v0' with .* cannot be drawn"):
         watch.film(finished(name))
     for name in (files.RECORD, files.EPISODES):
         (tmp_path / name).write_bytes((finished("CartPole-v1") / name).read_bytes())

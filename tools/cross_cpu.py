@@ -178,6 +178,7 @@ def begin(run: Any, config: Any, folder: Path) -> None:
 
     every_round: dict[str, Any]
     every_round = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "OBSERVER_SECONDS": 0.0}
+    os.environ.pop(run.CHECKPOINT_VARIABLE, None)  # which would come before the first of these
     try:
         with patch.multiple(run, **every_round):
             run.run(config, folder, interrupt)
@@ -307,7 +308,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], epilog="example: python -m tools.cross_cpu --short"
     )
-    parser.add_argument("--short", action="store_true", help="one training under each processor")
+    parser.add_argument(
+        "--short", action="store_true", help="three runs under Haswell, one under each other"
+    )
     parser.add_argument(
         "--engine", choices=["compiled", "torch"], default="compiled", help="(default: compiled)"
     )

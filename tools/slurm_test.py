@@ -64,7 +64,11 @@ def require() -> None:
     if CONFIGURATION.exists() or "SLURM_CONF" in os.environ:
         found = os.environ.get("SLURM_CONF", CONFIGURATION)
         left = CONFIGURATION.exists() and SIGN in CONFIGURATION.read_text(errors="replace")
-        advice = "a test that was killed left it: remove it" if left else "not touched"
+        advice = "not touched"
+        if left:
+            advice = (
+                "a test that was killed left it: end its slurmctld, slurmd and munged, remove it"
+            )
         raise Unfit(f"slurm test: there is a Slurm configuration already, {found}; {advice}")
     if os.geteuid() != 0:
         raise Unfit(f"slurm test: has to write {CONFIGURATION}, so it needs root")
@@ -250,12 +254,15 @@ def disturb(process: subprocess.Popen[bytes], results: Path) -> Iterator[tuple[s
             how = next((mishap for mishap in due if mishap in fitting), None)
             if how is None:
                 continue
-            if how == "cancelled":
-                ask("scancel", entry)
-            elif how == "preempted":
-                ask("scontrol", "requeue", entry)
-            else:
-                os.kill(pid, signal.SIGKILL)
+            try:
+                if how == "cancelled":
+                    ask("scancel", entry)
+                elif how == "preempted":
+                    ask("scontrol", "requeue", entry)
+                else:
+                    os.kill(pid, signal.SIGKILL)
+            except (ProcessLookupError, subprocess.CalledProcessError):
+                continue  # it has just ended: another will do
             due.remove(how)
             hit |= {run, entry}
             yield how, run
