@@ -36,8 +36,8 @@ def headline(folder: Path) -> list[str]:
         part for part in parts if len(part["environments"]) > 1 and part["baseline"] == PPO
     )
     return [
-        f"**Of the paper's {total} claims: {robust}** by robust metrics ({words} as the paper's own"
-        f" code measures). In {len(opposite) or 'none'} of the {len(failed)} comparisons that fail"
+        f"**Of the paper's {total} claims: {robust}** by robust metrics ({words} {LITERAL}). In"
+        f" {len(opposite) or 'none'} of the {len(failed)} comparisons that fail"
         f" is the opposite shown; {'the others' if opposite else 'they'} leave no room for an"
         f" advantage of {100 * WORTH_MENTIONING:.0f} %. Over the paper's environments the mean"
         " return of training with the learned β differs from PPO's by"

@@ -40,7 +40,7 @@ WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a corr
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
-LITERAL, ROBUST = "as the paper's code measures", "robust"
+LITERAL, ROBUST = "by the paper's words and code", "robust"
 
 
 class Part(NamedTuple):
