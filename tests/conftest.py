@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -24,6 +24,9 @@ from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import Study, read_study
+
+if TYPE_CHECKING:
+    from mace_rl.agent.ppo import PPO
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 
@@ -49,6 +52,23 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
     ) -> RunConfig:
         settings = study.run_config(environment, variant, seed).settings()
         return check(RunConfig, merge_layers(settings, changes), "the test")
+
+    return make
+
+
+@pytest.fixture
+def make_ppo(run_config):
+    """`make_ppo(environment, seed, intrinsic, engine, **settings of ppo)`."""
+    from shared import environment_of
+
+    from mace_rl import factories
+    from mace_rl.streams import Streams
+
+    def make(
+        environment="CartPole-v1", seed=0, intrinsic=False, engine="compiled", **settings
+    ) -> "PPO":
+        config = run_config(environment, "ppo", seed, ppo=settings, engine=engine)
+        return factories.ppo(config, environment_of(environment, seed), intrinsic, Streams(seed))
 
     return make
 
