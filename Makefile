@@ -40,11 +40,11 @@ test: setup ## every test, on up to 8 cores
 test-quick: setup ## the tests that take seconds, for the edit loop
 	@$(PYTEST) -m "not slow"
 
-tables: setup ## every table, figure and verdict from the runs in reference/, without training
+tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
 
 numbers: setup ## write what the tables of reference/ say into README and docs
-	@$(IN_VENV) tools.printed
+	@$(IN_VENV) tools.numbers
 
 report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)

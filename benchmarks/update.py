@@ -114,7 +114,7 @@ def parts() -> dict[str, tuple[Callable[[], Any], Callable[[], list[Any]]]]:
     acted = kernels.categorical_log_probs(logits, actions)
     grad_logits, _ = kernels.categorical_grad(logits, actions, advantages, 0.0)
     gradient = kernels.network_gradient(activations, grad_logits, parameters, sizes)
-    learnt = [parameters.copy(), np.zeros_like(parameters), np.zeros_like(parameters)]
+    learned = [parameters.copy(), np.zeros_like(parameters), np.zeros_like(parameters)]
     products = [random(STATES, 64), random(64, 64), random(STATES, 64)]
     products += [random(STATES, 64), random(STATES, 64), random(64, 64)]
 
@@ -134,8 +134,8 @@ def parts() -> dict[str, tuple[Callable[[], Any], Callable[[], list[Any]]]]:
         "surrogate, its gradient at the logits": (surrogate, surrogate),
         "backward": (backward, backward),
         "Adam": (
-            lambda: adam(learnt[0], gradient, learnt[1], learnt[2], 5, 3e-4),
-            lambda: learnt,
+            lambda: adam(learned[0], gradient, learned[1], learned[2], 5, 3e-4),
+            lambda: learned,
         ),
         PRODUCTS: (lambda: by_library(*products), lambda: products[3:]),
         OWN_PRODUCTS: (lambda: by_loops(*products), lambda: products[3:]),

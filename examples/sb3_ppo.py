@@ -65,17 +65,17 @@ def main() -> None:
                 sys.exit(f"sb3_ppo: no episode ended in --steps {arguments.steps}: give more")
             last = returns[-max(len(returns) // 10, 1) :]
             found[:, int(curious), i] = returns.mean(), last.mean()
-        row = [f"{value:.2f}" for value in found[:, :, i].ravel()]
+        row = [f"{value:z.2f}" for value in found[:, :, i].ravel()]
         print("|", " | ".join([str(seed), *row]), "|", flush=True)
     rng = np.random.default_rng(0)
     cells = []
     for values in found.reshape(-1, len(seeds)):
         low, high = mean_interval(values, 0.95, 10_000, rng)
-        cells.append(f"{values.mean():.2f} ({low:.2f} to {high:.2f})")
+        cells.append(f"{values.mean():z.2f} ({low:z.2f} to {high:z.2f})")
     print("| mean |", " | ".join(cells), "|\n")
     for name, (without, with_curiosity) in zip(MEASURES, found, strict=True):
         gain = paired_comparison(with_curiosity, without, 0.95, 10_000, rng)
-        interval = f"{gain.difference:.2f} ({gain.low:.2f} to {gain.high:.2f})"
+        interval = f"{gain.difference:z.2f} ({gain.low:z.2f} to {gain.high:z.2f})"
         print(f"with curiosity minus without, {name}: {interval}, p = {gain.p_value:.4f}")
 
 

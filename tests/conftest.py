@@ -164,7 +164,7 @@ def interrupted(run_config, tmp_path, kill, checkpoint_every, monkeypatch):
 
 
 @pytest.fixture
-def learnt(monkeypatch) -> list[np.ndarray]:
+def learned(monkeypatch) -> list[np.ndarray]:
     """The gradients that reach optimisers, as they come."""
     from mace_rl.agent.adam import Adam
 

@@ -128,7 +128,7 @@ def test_beta_of_the_next_episode_is_the_lstm_s_answer_to_the_last(make):
     assert controller.beta == pytest.approx(expected.item(), abs=1e-6)
 
 
-# --- What is learnt -----------------------------------------------------------------------------
+# --- What is learned -----------------------------------------------------------------------------
 
 
 def slow_progress(returns: list[float], beta: float) -> list[float]:
@@ -171,7 +171,7 @@ def judge(controller: MetaAdaptation, credits: list[float]) -> float | None:
 
 
 @pytest.mark.parametrize("credits", [[0.7], [-0.7], [0.5, -0.2, 0.9]])
-def test_lstm_receives_credit_and_prior_through_the_logit(make, learnt, credits):
+def test_lstm_receives_credit_and_prior_through_the_logit(make, learned, credits):
     controller, rng = make(hidden_units=6, horizon=1, prior=0.3), np.random.default_rng(0)
     controller.network.split(controller.network.parameters)[-1][:] += 0.7  # away from the prior
     for _ in range(len(credits) + 1):  # the first β is given, so one more
@@ -185,7 +185,7 @@ def test_lstm_receives_credit_and_prior_through_the_logit(make, learnt, credits)
     terms = [c * x - 0.3 / 2 * (x - initial) ** 2 for c, x in zip(credits, logits, strict=True)]
     # Adam descends, so the gradient is that of minus the objective.
     expected = twin.gradient(-torch.cat(terms).mean())
-    (gradient,) = learnt
+    (gradient,) = learned
     np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-6)
     assert all((part != 0).any() for part in controller.network.split(gradient))
 
@@ -204,8 +204,8 @@ def test_beta_follows_what_helped_and_comes_back_when_nothing_is_left_to_learn(m
             assert 0 < controller.beta < 1
         return controller.beta
 
-    learnt = play(150, 1.0)
-    assert (learnt > 0.9) if rises else (learnt < 0.1)
+    learned = play(150, 1.0)
+    assert (learned > 0.9) if rises else (learned < 0.1)
     assert play(600, 1e-6) == pytest.approx(0.4, abs=0.05)
 
 

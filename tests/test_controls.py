@@ -198,7 +198,7 @@ def test_wrong_settings_get_one_line(run_config, beta, message):
     assert "\n" not in str(caught.value)
 
 
-def test_the_study_of_controls_compares_the_learnt_beta_with_each():
+def test_the_study_of_controls_compares_the_learned_beta_with_each():
     study = read_study([ROOT / "config.yaml", ROOT / "config" / "controls.yaml"])
     assert len(set(study.colours.values())) == len(set(study.labels.values())) == 13
     others = [variant for variant in study.variants if variant != "mace_full"]

@@ -113,21 +113,21 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
 class Watched(Trainer):
     """Keeps, round by round, what was played, by which weights, and what reached the LSTM.
 
-    learnt: the gradients that reached any optimiser so far.
+    learned: the gradients that reached any optimiser so far.
     """
 
-    def __init__(self, config: RunConfig, learnt: list[np.ndarray]) -> None:
+    def __init__(self, config: RunConfig, learned: list[np.ndarray]) -> None:
         super().__init__(config)
-        self.learnt = learnt
+        self.learned = learned
         self.rounds: list[Round] = []
 
     def adapt(self, rollout: list[Experience]) -> float | None:
         meta, adam = Twin(self.controller.network), self.ppo.optimisers["actor"]
-        policy, square, before = adam.parameters.copy(), adam.square.copy(), len(self.learnt)
+        policy, square, before = adam.parameters.copy(), adam.square.copy(), len(self.learned)
         credit = super().adapt(rollout)
         directions = [judged.direction.copy() for judged in self.controller.judged[-len(rollout) :]]
-        learnt, time = self.learnt[before:], adam.time
-        self.rounds.append(Round(rollout, policy, square, time, meta, directions, learnt))
+        learned, time = self.learned[before:], adam.time
+        self.rounds.append(Round(rollout, policy, square, time, meta, directions, learned))
         return credit
 
 
@@ -140,7 +140,7 @@ class Round(NamedTuple):
     time: int
     meta: Twin  # as it was while it was played
     directions: list[np.ndarray]  # for each of its episodes the change of the update by its β
-    learnt: list[np.ndarray]  # the gradient, if any, that reached the meta network after it
+    learned: list[np.ndarray]  # the gradient, if any, that reached the meta network after it
 
 
 @pytest.fixture(
@@ -153,7 +153,7 @@ class Round(NamedTuple):
     ],
     ids=str,
 )
-def watched(request, run_config, learnt) -> Watched:
+def watched(request, run_config, learned) -> Watched:
     """A finished short run; a rollout is one episode, or several."""
     environment, steps, engine = request.param
     several = steps > 1
@@ -163,7 +163,7 @@ def watched(request, run_config, learnt) -> Watched:
         "ppo": {"rollout_steps": steps, "gae_lambda": 0.95, "centre_advantages": several},
         "meta": {"hidden_units": 16, "horizon": 2},
     }
-    trainer = Watched(run_config(environment, "mace_full", 2, **changes), learnt)
+    trainer = Watched(run_config(environment, "mace_full", 2, **changes), learned)
     assert [record.episode for record in finish(trainer).records] == [*range(1, 15)]
     assert (max(len(each.rollout) for each in trainer.rounds) > 1) == several
     return trainer
@@ -184,7 +184,7 @@ def read_sequences(trainer: Watched) -> list[np.ndarray]:
 
 
 def test_each_beta_comes_from_the_episode_before(watched):
-    """From the meta network as it has learnt from all rounds before; the first one is given."""
+    """From the meta network as it has learned from all rounds before; the first one is given."""
     sequences = read_sequences(watched)
     played = [(item.beta, each.meta) for each in watched.rounds for item in each.rollout]
     assert played[0][0] == 0.4
@@ -279,7 +279,7 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
             if source is not None
         ]
         if not known:  # too early, or only the first β, which was given
-            assert each.learnt == [] and math.isnan(told)
+            assert each.learned == [] and math.isnan(told)
             continue
         assert told == pytest.approx(np.mean([credit for credit, _ in known]), rel=2e-2, abs=1e-3)
         terms = []
@@ -290,5 +290,5 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
         expected = each.meta.gradient(-sum(terms).sum() / len(terms))
         largest = np.abs(expected).max()
         assert largest > 0
-        (found,) = each.learnt
+        (found,) = each.learned
         np.testing.assert_allclose(found, expected, rtol=2e-2, atol=5e-3 * largest)

@@ -53,7 +53,7 @@ def studies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)  # and back
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     monkeypatch.setattr(tables, "SHARED", ())
-    monkeypatch.setattr(tables.archive, "unpack", lambda kept, made: 7)
+    monkeypatch.setattr(tables.kept_runs, "unpack", lambda kept, made: 7)
     monkeypatch.setattr(
         tables, "make_all", lambda found: [make(name, found[name]) for name in found]
     )

@@ -94,11 +94,11 @@ def test_convergence_at_the_first_peak_after_the_steepest_rise():
 
 
 def test_a_late_collapse_moves_the_steepest_rise_but_not_the_convergence():
-    learnt = ramp(0, 300, 300)
-    collapse = np.concatenate([learnt, np.zeros(50), np.full(600, 300.0)])
-    for returns in (learnt, collapse):
+    learned = ramp(0, 300, 300)
+    collapse = np.concatenate([learned, np.zeros(50), np.full(600, 300.0)])
+    for returns in (learned, collapse):
         assert m.convergence_steps(curve(returns, random=0)) == (378, False)  # k = 78, as above
-    assert m.convergence_steps_steepest(curve(learnt)) == (399, False)
+    assert m.convergence_steps_steepest(curve(learned)) == (399, False)
     assert m.convergence_steps_steepest(curve(collapse)) == (750, False)
 
 

@@ -11,7 +11,14 @@ from invented import table_for_claims
 
 from mace_rl.config.study import Study
 from mace_rl.results import claims, claims_text
-from tools import archive, bonus_share, convergence_simulation, coverage, meta_signal, printed
+from tools import (
+    bonus_share,
+    convergence_simulation,
+    interval_coverage,
+    kept_runs,
+    meta_signal,
+    numbers,
+)
 from tools.shown import results, runs
 
 ROOT = Path(__file__).parents[1]
@@ -21,7 +28,7 @@ def test_the_pages_say_what_the_kept_tables_say(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
-    printed.main()
+    numbers.main()
     said = capsys.readouterr().out
     assert said.endswith("marked texts, 0 differ\n")
     assert int(said.split()[0]) >= 5
@@ -36,27 +43,27 @@ def test_a_number_that_is_not_printed_is_refused_and_mended(
     page.write_text(
         "<!-- python -m tools.show means reference/tables/baseline -->\n9\n<!-- end -->"
     )
-    monkeypatch.setattr(printed, "ROOT", tmp_path)
+    monkeypatch.setattr(numbers, "ROOT", tmp_path)
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
     with pytest.raises(SystemExit, match=r"README\.md: means reference/tables/baseline"):
-        printed.main()
+        numbers.main()
     assert "\n9\n" in page.read_text()
     monkeypatch.setattr("sys.argv", ["numbers"])
-    printed.main()
+    numbers.main()
     assert "| Acrobot-v1 | ppo | 20 |" in page.read_text()
     page.write_text("<!-- python -m tools.show means reference/none -->\n<!-- end -->")
     with pytest.raises(SystemExit, match="reference/none"):
-        printed.main()
+        numbers.main()
     mark = "<!-- python -m tools.show means reference/tables/baseline -->"
     for text in (f"{mark}\nwords\n{mark}\n<!-- end -->\n", f"{mark}\n", f"{mark} 9\n<!-- end -->"):
         page.write_text(text)
-        with pytest.raises(SystemExit, match=r"README\.md: a mark has no text with an end"):
-            printed.main()
+        with pytest.raises(SystemExit, match=r"README\.md: not each .* has its <!-- end -->"):
+            numbers.main()
         assert page.read_text() == text
 
 
 def test_the_study_page_has_no_decimal_or_count_of_its_own() -> None:
-    text = printed.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
+    text = numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
 
@@ -66,7 +73,7 @@ def test_the_metrics_page_says_what_the_simulations_print(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (ROOT / "docs/metrics.md").read_text(encoding="utf-8")
-    coverage.main(2000)
+    interval_coverage.main(2000)
     assert "\n\n" + capsys.readouterr().out + "\n" in page
     monkeypatch.setattr("sys.argv", ["convergence_simulation"])
     convergence_simulation.main()
@@ -107,6 +114,19 @@ def test_the_headline_counts_the_verdicts(tmp_path: Path, study: Study) -> None:
     assert share == pytest.approx(30, abs=3)
     assert len(results.ledger(tmp_path)) == 12
     assert sum("| holds |" in line for line in results.parts(tmp_path)) == 22
+
+
+def test_differences_are_of_one_metric_and_of_single_environments(tmp_path: Path) -> None:
+    row = {"variant": "full", "baseline": "ppo", "seeds": 12, "low": -3.0, "high": 0.123456}
+    rows = [
+        {**row, "env": "A-v0", "metric": "return", "difference": -1.5, "p_value": 0.01234},
+        {**row, "env": "A-v0", "metric": "area_under_curve", "difference": 9.0, "p_value": 0.5},
+        {**row, "env": "all", "metric": "return", "difference": np.nan, "p_value": np.nan},
+    ]
+    table = pd.DataFrame(rows)
+    table.assign(p_holm=3 * table["p_value"]).to_csv(tmp_path / "comparisons.csv", index=False)
+    lines = results.differences(tmp_path, "return")
+    assert lines[2:] == ["| A-v0 | full − ppo | 12 | −1.5 (−3 to 0.1235) | 0.0123 | 0.0370 |"]
 
 
 def test_together_weighs_every_environment_alike(tmp_path: Path) -> None:
@@ -183,7 +203,7 @@ def test_the_betas_of_each_seed_are_in_order_of_size(tmp_path: Path) -> None:
         frame = pd.DataFrame({"beta": [1.0] * 18 + [last, last + 0.1]})
         content[f"seed{seed}/episodes.csv"] = frame.to_csv(index=False).encode()
         content[f"seed{seed}/run.json"] = b"{}"
-    archive.write(tmp_path / "A-v0" / "mace_full.tar.xz", content)
+    kept_runs.write(tmp_path / "A-v0" / "mace_full.tar.xz", content)
     assert runs.betas(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.25, 0.55 |"]
     assert runs.lowest(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.20, 0.50 |"]
 

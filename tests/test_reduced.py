@@ -20,7 +20,7 @@ from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_fig
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
 from mace_rl.results.tables import table1, table1_latex
-from tools import archive
+from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
 EXPECTED, KEPT = ROOT / "docs" / "reduced", ROOT / "reference" / "study"
@@ -33,7 +33,7 @@ def runs(tmp_path_factory) -> dict[RunKey, pd.DataFrame]:
     """The records of the reduced study's runs."""
     cut, frames = tmp_path_factory.mktemp("reduced") / files.EPISODES, {}
     kept = {
-        (environment, variant): archive.read(KEPT / environment / f"{variant}.tar.xz")
+        (environment, variant): kept_runs.read(KEPT / environment / f"{variant}.tar.xz")
         for environment in STUDY.environments
         for variant in STUDY.variants
     }

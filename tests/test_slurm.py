@@ -135,7 +135,7 @@ def test_a_cluster_of_somebody_elses_is_refused(programs: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "advice"),
-    [("ClusterName=theirs\n", "not touched"), (f"{slurm_test.SIGN}\n", "remove it")],
+    [("ClusterName=theirs\n", "not touched"), (f"{slurm_test.SIGN}\n", "remove the file")],
 )
 def test_a_configuration_is_refused_and_left_alone(
     tmp_path: Path, programs: Path, monkeypatch: pytest.MonkeyPatch, content: str, advice: str

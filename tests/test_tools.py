@@ -14,18 +14,24 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["Foo-v0", "3"], "config.yaml: environments has 'Foo-v0', which is not in Gymnasium's"),
-        (["CartPole-v9", "3"], "config.yaml: environments has 'CartPole-v9', which is not in"),
-        (["nope:Foo-v0", "3"], "config.yaml: in the settings of nope:Foo-v0 and"),
-        (["CliffWalking-v1", "3"], "config.yaml: environments has 'CliffWalking-v1', which has no"),
+        (["Foo-v0", "3"], "environment has 'Foo-v0', which is not in Gymnasium's registry"),
+        (["CartPole-v9", "3"], "environment has 'CartPole-v9', which is not in Gymnasium's"),
+        (["nope:Foo-v0", "3"], "in the settings of nope:Foo-v0 and"),
+        (["CliffWalking-v1", "3"], "environment has 'CliffWalking-v1', which has no time limit"),
         (["CartPole-v1", "3", "no.yaml"], "no.yaml: cannot be read: "),
+        (["CartPole-v1", "3", "three.yaml"], "config.yaml + three.yaml: metrics "),
+        (["CartPole-v1", "3", "maps.yaml"], "CartPole-v1 cannot be made: "),
         (["CartPole-v1", "1"], "EPISODES is 1, but should be at least 2"),
         (["CartPole-v1", "-3"], "EPISODES is -3, but should be at least 2"),
     ],
 )
 def test_what_has_no_random_return(
-    monkeypatch: pytest.MonkeyPatch, words: list[str], expected: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str], expected: str
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "three.yaml").write_text("metrics: 3\n")
+    maps = "environment_settings: {CartPole-v1: {environment_arguments: {map_name: 4x4}}}\n"
+    (tmp_path / "maps.yaml").write_text(maps)
     said = message(monkeypatch, random_return, "--", *words)
     assert said.startswith(f"random_return: {expected}")
 

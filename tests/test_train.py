@@ -32,7 +32,7 @@ def without_bonus(records: list[EpisodeRecord]) -> list[dict]:
     return [{**vars(record), "intrinsic_return": None} for record in records]
 
 
-def learnt(trainer: Trainer) -> list[bytes]:
+def learned(trainer: Trainer) -> list[bytes]:
     """Weights and moments of the networks that plain PPO has, and its normaliser."""
     optimisers = [trainer.ppo.optimisers[name] for name in ("actor", "extrinsic")]
     arrays = [part for adam in optimisers for part in (adam.parameters, adam.mean, adam.square)]
@@ -55,7 +55,7 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
     full = finish(run_config(environment, "mace_full", 3, **changes))
     for trainer in (fixed, full):
         assert without_bonus(trainer.records) == without_bonus(plain.records)
-        assert learnt(trainer) == learnt(plain)
+        assert learned(trainer) == learned(plain)
         assert trainer.noise.bit_generator.state == plain.noise.bit_generator.state
         # The parts that must not matter did work.
         assert sum(record.intrinsic_return for record in trainer.records) > 10
@@ -64,11 +64,11 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
     assert (full.controller.network.parameters != untrained.parameters).any()
 
 
-def test_beta_above_0_changes_what_is_learnt(run_config):
+def test_beta_above_0_changes_what_is_learned(run_config):
     """Else the test above would pass for a bonus that is lost on the way."""
     plain = finish(run_config("CartPole-v1", "ppo", 3, episodes=3))
     fixed = finish(run_config("CartPole-v1", "mace_fixed", 3, episodes=3))
-    assert learnt(plain)[0] != learnt(fixed)[0]
+    assert learned(plain)[0] != learned(fixed)[0]
 
 
 # --- The same seed is the same run --------------------------------------------------------------

@@ -141,7 +141,7 @@ def test_the_bonus_keeps_its_strength_when_the_unit_of_reward_changes(unit):
         assert large["reward_curiosity"] == pytest.approx(unit * small["reward_curiosity"], 1e-3)
 
 
-def test_an_episode_that_is_reset_early_is_not_learnt_from():
+def test_an_episode_that_is_reset_early_is_not_learned_from():
     env = CuriosityReward(gymnasium.make("CartPole-v1"), seed=3)
     play(env, 300)
     before = archive(env.state_dict())

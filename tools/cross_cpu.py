@@ -309,7 +309,9 @@ def main() -> None:
         description=__doc__.splitlines()[0], epilog="example: python -m tools.cross_cpu --short"
     )
     parser.add_argument(
-        "--short", action="store_true", help="three runs under Haswell, one under each other"
+        "--short",
+        action="store_true",
+        help="three trainings under Haswell, one under each of the others",
     )
     parser.add_argument(
         "--engine", choices=["compiled", "torch"], default="compiled", help="(default: compiled)"

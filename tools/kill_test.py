@@ -37,6 +37,7 @@ TRAIN = (
 ATTEMPTS = 3  # to hit a moment
 OFTEN = {"MACE_RL_CHECKPOINT_SECONDS": "0.05"}
 RESULTS = {*files.RESULTS, files.RECORD}
+CHECKPOINTS = f"runs/*/*/*/{files.CHECKPOINT}"  # of a workflow
 
 
 def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[bytes]:
@@ -176,10 +177,10 @@ def kill_workflows(scratch: Path) -> list[bool]:
             "cwd": ROOT,
             "env": os.environ | OFTEN,
         }
-        hit, runs = False, f"runs/*/*/*/{files.CHECKPOINT}"
+        hit = False
         if sent:
             process = subprocess.Popen(command, start_new_session=True, **quiet)
-            while process.poll() is None and not list(results.glob(runs)):
+            while process.poll() is None and not list(results.glob(CHECKPOINTS)):
                 time.sleep(0.05)
             hit = process.poll() is None
             if hit and sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
@@ -188,7 +189,7 @@ def kill_workflows(scratch: Path) -> list[bool]:
                 process.send_signal(sent)
             process.wait()
             time.sleep(3)  # jobs of a killed Snakemake notice and end
-        cut = [path.parent for path in results.glob(runs) if cut_off(path.parent)]
+        cut = [path.parent for path in results.glob(CHECKPOINTS) if cut_off(path.parent)]
         again = subprocess.run(command, **quiet, check=False)
         found[name] = contents(results)
         if sent:

@@ -38,7 +38,7 @@ from mace_rl.factories import beta_controller
 from mace_rl.files import write_atomically
 from mace_rl.streams import Streams
 from mace_rl.train import Trainer
-from tools.random_return import study_of
+from tools.random_return import study_with
 
 BETA, STEP = 0.4, 0.05
 PROBES = 60  # updates of a run whose finite difference is taken, evenly over its episodes
@@ -115,7 +115,7 @@ class Probe(Trainer):
 
 def main(file: Path, environment: str, episodes: int, seeds: int, overlays: list[str]) -> None:
     """Measure one environment, and put its rows into `file`."""
-    study = study_of(environment, overlays)
+    study = study_with(overlays)
     constant = ConstantBeta(kind="constant", value=BETA)
     runs = []
     for seed in range(1000, 1000 + seeds):

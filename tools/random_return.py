@@ -21,26 +21,32 @@ from mace_rl.config.study import Study, load_study
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def study_of(environment: str, overlays: list[str]) -> Study:
-    """The study of config.yaml and the files over it, in this environment alone.
+def study_with(overlays: list[str]) -> Study:
+    """The study of config.yaml and the files over it, but in the environments of the former.
 
-    `ConfigError` for what cannot be one; a random return is not asked for.
+    Those of the latter need no random return yet. `ConfigError` for what cannot be a study.
     """
-    config = read_yaml(ROOT / "config.yaml")
+    base = config = read_yaml(ROOT / "config.yaml")
     for overlay in overlays:
         config = merge(config, read_yaml(Path(overlay)))
-    config["environments"] = [environment]
-    config["metrics"]["random_return"].setdefault(environment, 0.0)
-    return load_study(config, " + ".join(["config.yaml", *overlays]))
+    environments = {"environments": base["environments"]}
+    return load_study(config | environments, " + ".join(["config.yaml", *overlays]))
 
 
 def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
-    """Undiscounted return of each episode, [episodes], with seed 0."""
-    env = gymnasium.make(
-        config.environment,
-        max_episode_steps=config.max_episode_steps,
-        **config.environment_arguments,
-    )
+    """Undiscounted return of each episode, [episodes], with seed 0.
+
+    `ConfigError` if the environment cannot be made with these arguments.
+    """
+    try:
+        env = gymnasium.make(
+            config.environment,
+            max_episode_steps=config.max_episode_steps,
+            **config.environment_arguments,
+        )
+    except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{config.environment} cannot be made: {reason}") from error
     env.action_space.seed(0)
     env.reset(seed=0)
     returns = np.zeros(episodes)
@@ -68,10 +74,10 @@ def main() -> None:
     if episodes < 2:
         sys.exit(f"random_return: EPISODES is {episodes}, but should be at least 2")
     try:
-        config = study_of(name, arguments.configs).run_config(name, "ppo", 0)
+        config = study_with(arguments.configs).run_config(name, "ppo", 0)
+        measured = random_returns(config, episodes)
     except ConfigError as error:
         sys.exit(f"random_return: {error}")
-    measured = random_returns(config, episodes)
     standard_error = measured.std(ddof=1) / np.sqrt(episodes)
     print(f"{name}: {measured.mean():.4g} (standard error {standard_error:.2g})")
 

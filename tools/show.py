@@ -3,8 +3,8 @@
     .venv/bin/python -m tools.show WHAT FOLDER [...]
 
 FOLDER is one of reference/tables, or the results of any study; of the last five reference/study
-and reference/measured. Intervals and what is computed of kept runs are as `metrics` of config.yaml
-has it, also where a study's own files had other settings. WHAT is one of
+and reference/measured. Intervals that a study's files have are printed as they are; those that are
+computed here follow `metrics` of config.yaml. WHAT is one of
 
     headline    what holds, in three sentences                                      (claims.json)
     ledger      a verdict for each claim                                           (claims.json)
@@ -14,13 +14,14 @@ has it, also where a study's own files had other settings. WHAT is one of
     solved      how many seeds solve each task                                     (metrics.csv)
     constants   mean return of training by variant, in columns                     (metrics.csv)
     finals      final return [worst seed] / mean return of training, in columns     (metrics.csv)
-    regret      what the learnt β loses against the best constant                   (regret.csv)
+    regret      what the learned β loses against the best constant                   (regret.csv)
     improvement probability that one variant's run is better than another's    (comparisons.csv)
+    differences of the same pairs, by seed; p, by itself and corrected         (comparisons.csv)
     together    the same over the environments of several studies: `together FOLDER NAME ... VARIANT
                 OTHER ...`, NAMEs of folders beside FOLDER                         (metrics.csv)
     aggregate   scores between random and the best run, all environments          (aggregate.csv)
     readings    Table 1 under every reading                                         (readings.md)
-    betas       the learnt β at the end of training: `betas FOLDER ENVIRONMENT ...`   (kept runs)
+    betas       the learned β at the end of training: `betas FOLDER ENVIRONMENT ...`   (kept runs)
     lowest      the lowest that it was; arguments as of betas                      (kept runs)
     stagnation  how it goes with stagnation (C9); arguments as of betas            (kept runs)
     shares      the bonus's share of the advantages, by β                       (bonus_share.csv)
@@ -40,7 +41,7 @@ SHOWN: dict[str, Callable[..., list[str]]] = {
     for function in (
         *(results.headline, results.ledger, results.parts, results.table1, results.means),
         *(results.solved, results.constants, results.finals, results.regret, results.improvement),
-        *(results.together, results.aggregate, results.readings),
+        *(results.differences, results.together, results.aggregate, results.readings),
         *(runs.betas, runs.lowest, runs.stagnation, runs.shares, runs.signals),
     )
 }

@@ -67,7 +67,8 @@ def require() -> None:
         advice = "not touched"
         if left:
             advice = (
-                "a test that was killed left it: end its slurmctld, slurmd and munged, remove it"
+                "a test that was killed left it: end its slurmctld, slurmd and munged, and remove"
+                " the file"
             )
         raise Unfit(f"slurm test: there is a Slurm configuration already, {found}; {advice}")
     if os.geteuid() != 0:
@@ -261,8 +262,11 @@ def disturb(process: subprocess.Popen[bytes], results: Path) -> Iterator[tuple[s
                     ask("scontrol", "requeue", entry)
                 else:
                     os.kill(pid, signal.SIGKILL)
-            except (ProcessLookupError, subprocess.CalledProcessError):
+            except ProcessLookupError:
                 continue  # it has just ended: another will do
+            except subprocess.CalledProcessError as error:
+                print(f"{how}, entry {entry}: {error.stderr.strip()}", flush=True)
+                continue  # if it has just ended, another will do
             due.remove(how)
             hit |= {run, entry}
             yield how, run

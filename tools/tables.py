@@ -1,4 +1,4 @@
-"""Every table, figure and verdict from the runs that are kept, without training.
+"""The tables, figures and verdicts of the studies that are kept, without training.
 
     python -m tools.tables [--check]        (make tables)
     python -m tools.tables --report STUDY   (make report)
@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 
 from mace_rl.config.reading import read_yaml
 from mace_rl.sources import digest
-from tools import archive
+from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 # What the workflow and its jobs import, or let be imported, which takes longer than most of the
@@ -164,7 +164,7 @@ def main() -> None:
         if stale.exists():
             shutil.rmtree(stale)
     with ThreadPoolExecutor(1) as beside:
-        unpacked = beside.submit(archive.unpack, KEPT, MADE)
+        unpacked = beside.submit(kept_runs.unpack, KEPT, MADE)
         for module in SHARED:
             importlib.import_module(module)
         runs = unpacked.result()

@@ -161,7 +161,9 @@ class Appraisal:
         """See `CuriosityReward`."""
         state, mine = copy.deepcopy(state), self.described()
         if missing := mine.keys() - state["settings"]:
-            raise ConfigError(f"the state to load does not say which {min(missing)} it is of")
+            raise ConfigError(
+                f"the state to load has no setting {min(missing)}: another version saved it"
+            )
         for name, value in state["settings"].items():
             if name not in mine:
                 raise ConfigError(

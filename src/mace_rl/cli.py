@@ -1,4 +1,4 @@
-"""The command `mace-rl`: train one run, play with its agent, film it, repeat kept runs."""
+"""The command `mace-rl`: train one run, evaluate or film its agent, export records, repeat runs."""
 
 import argparse
 import logging

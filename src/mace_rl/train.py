@@ -4,9 +4,9 @@
 
 One `Trainer` is one run. Each round plays whole episodes with the current policy, weighs the
 curiosity bonus of each episode with its β, updates the policy by PPO, and lets the episodes become
-memory. The phases are methods, named after the paper's terms. What they use is in the rooms of
-those names: `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta network),
-`environments`; `factories` makes them as the settings ask for.
+memory. The phases are methods: `collect`, `appraise`, `adapt`, `improve`. What they use is in the
+rooms `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta network) and
+`environments`; `factories` makes it as the settings ask for.
 """
 
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ class Trainer:
         self.controller = beta_controller(config, self.environment, streams)
         self.curiosity = intrinsic_reward(config, self.environment, streams)
         self.ppo = ppo(config, self.environment, self.curiosity is not None, streams)
-        self.rollout = rollout_for(self.environment, self.ppo.acting_policy())
+        self.play = rollout_for(self.environment, self.ppo.acting_policy())
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
@@ -89,7 +89,7 @@ class Trainer:
         wanted = self.config.ppo.rollout_steps
         while collected < wanted and len(self.records) < self.config.episodes:
             noise = draw_noise(self.environment, self.noise)
-            episode = self.rollout(self.environment, policy, noise)
+            episode = self.play(self.environment, policy, noise)
             rollout.append(self.appraise(episode))
             collected += len(episode)
         return rollout
@@ -97,12 +97,11 @@ class Trainer:
     def appraise(self, episode: Episode) -> Experience:
         """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
         observations = self.ppo.normalise(episode.observations)
-        extrinsic = self.ppo.advantages_and_returns(
+        extrinsic_advantages, extrinsic_returns = self.ppo.advantages_and_returns(
             "extrinsic", observations, episode.rewards, episode.terminated
         )
-        beta, bonus = 0.0, None
-        reward = np.zeros(len(episode))
-        intrinsic = reward, reward
+        beta, bonus, intrinsic_scale = 0.0, None, 1.0
+        reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta = self.controller.beta
             require_share("β", beta)
@@ -110,10 +109,11 @@ class Trainer:
             reward = bonus.reward
             require_share("the curiosity bonus", reward, 1e-6, self.curiosity.largest)
             reward = np.maximum(reward, 0.0)
-            intrinsic = self.ppo.advantages_and_returns(
+            intrinsic_advantages, intrinsic_returns = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
             )
-            self.curiosity.remember(episode, extrinsic[1] * self.ppo.reward_scale("extrinsic"))
+            intrinsic_scale = self.ppo.advantage_scale("intrinsic")
+            self.curiosity.remember(episode, extrinsic_returns * self.ppo.reward_scale("extrinsic"))
             self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
@@ -127,10 +127,18 @@ class Trainer:
                 terminated=int(episode.terminated),
             )
         )
-        scales = self.ppo.advantage_scale("extrinsic"), 1.0
-        if self.curiosity is not None:
-            scales = scales[0], self.ppo.advantage_scale("intrinsic")
-        return Experience(episode, observations, beta, bonus, *extrinsic, *intrinsic, *scales)
+        return Experience(
+            episode=episode,
+            observations=observations,
+            beta=beta,
+            bonus=bonus,
+            extrinsic_advantages=extrinsic_advantages,
+            extrinsic_returns=extrinsic_returns,
+            intrinsic_advantages=intrinsic_advantages,
+            intrinsic_returns=intrinsic_returns,
+            extrinsic_scale=self.ppo.advantage_scale("extrinsic"),
+            intrinsic_scale=intrinsic_scale,
+        )
 
     def adapt(self, rollout: list[Experience]) -> float | None:
         """Meta-adaptation: tell the controller what each β changes in the update, before it.

@@ -12,7 +12,7 @@ bonus adds up to varies 0.4 times as much as what the environment pays, or as 1 
 
 β and u belong to an episode and hold from its beginning to its end. With it the episode becomes
 memory, all novelty is updated, and β is set anew. Before the first end u is not known: it is 0, and
-nothing is paid yet. From an episode that is reset before it ends nothing is learnt.
+nothing is paid yet. From an episode that is reset before it ends nothing is learned.
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
 
     env: observations are arrays of one shape (Box; they are flattened) or Discrete, actions are
         Discrete or one-dimensional; Gymnasium's `FlattenObservation` makes vectors of others. Its
-        episodes have to end, if need be by a time limit: nothing is learnt from one that does not.
+        episodes have to end, if need be by a time limit: nothing is learned from one that does not.
     beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …}, "random", "bandit", "custom". Not "meta", which learns from policy
         gradients.

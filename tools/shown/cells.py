@@ -20,13 +20,13 @@ def mean(values: pd.Series, form: str = ".4g") -> str:
     low, high = mean_interval(
         numbers, SETTINGS.confidence, SETTINGS.bootstrap_repetitions, generator
     )
-    shown = [format(value, form).replace("-", "−") for value in (numbers.mean(), low, high)]
+    shown = [format(value, f"z{form}").replace("-", "−") for value in (numbers.mean(), low, high)]
     return f"{shown[0]} ({shown[1]} to {shown[2]})"
 
 
 def short(value: float | str) -> str:
     """Four significant digits, with a true minus; an empty cell stays empty."""
-    return f"{float(value):.4g}".replace("-", "−") if value != "" else ""
+    return f"{float(value):z.4g}".replace("-", "−") if value != "" else ""
 
 
 def number(value: float | str, digits: int) -> str:

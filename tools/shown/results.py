@@ -21,7 +21,7 @@ AREA = "area_under_curve"
 
 
 def headline(folder: Path) -> list[str]:
-    """How many claims came out how, and what the learnt β changes in the return of training."""
+    """How many claims came out how, and what the learned β changes in the return of training."""
     found = _claims(folder)
     counts = Counter(claim[ROBUST]["verdict"] for claim in found["claims"])
     literal = Counter(claim[LITERAL]["verdict"] for claim in found["claims"])
@@ -36,10 +36,12 @@ def headline(folder: Path) -> list[str]:
         part for part in parts if len(part["environments"]) > 1 and part["baseline"] == PPO
     )
     return [
-        f"**Of the paper's {total} claims: {robust}** by robust metrics ({words} {LITERAL}). In"
-        f" {len(opposite) or 'none'} of the {len(failed)} comparisons that fail"
-        f" is the opposite shown; {'the others' if opposite else 'they'} leave no room for an"
-        f" advantage of {100 * WORTH_MENTIONING:.0f} %. Over the paper's environments the mean"
+        f"**Of the paper's {total} claims: {robust}** by robust metrics ({words} {LITERAL})."
+        f" {len(opposite) or 'None'} of the {len(failed)} comparisons that fail"
+        f" {'show' if len(opposite) > 1 else 'shows'} the opposite of the claim;"
+        f" {'each of the others' if opposite else 'each'} rules out an improvement of"
+        f" {100 * WORTH_MENTIONING:.0f} %."
+        " Over the paper's environments the mean"
         " return of training with the learned β differs from PPO's by"
         f" {percent(overall['difference'])} of the way from random actions to the reference"
         f" return (95 % interval {percent(overall['low'])} to {percent(overall['high'])}, at"
@@ -136,10 +138,7 @@ def regret(folder: Path) -> list[str]:
 
 def improvement(folder: Path, metric: str = AREA) -> list[str]:
     """P(a run of one is better) in each environment and over all, from comparisons.csv."""
-    table = pd.read_csv(folder / "comparisons.csv")
-    table = table[table["metric"] == metric]
-    if table.empty:
-        sys.exit(f"show: {folder / 'comparisons.csv'} has no metric {metric!r}")
+    table = _comparisons(folder, metric)
     environments = list(table["env"].unique())
     lines = [f"| | {' | '.join(environments)} |", "|---" * (1 + len(environments)) + "|"]
     for (variant, baseline), rows in table.groupby(["variant", "baseline"], sort=False):
@@ -150,6 +149,21 @@ def improvement(folder: Path, metric: str = AREA) -> list[str]:
             for name in environments
         ]
         lines.append(f"| {variant} over {baseline} | {' | '.join(cells)} |")
+    return lines
+
+
+def differences(folder: Path, metric: str = AREA) -> list[str]:
+    """Mean of the paired differences, with their test by itself and corrected."""
+    lines = ["| | | seeds | difference | p | p, corrected |", "|---" * 6 + "|"]
+    for _, row in _comparisons(folder, metric).iterrows():
+        if pd.isna(row["difference"]):
+            continue  # over all environments there is a probability only
+        value, low, high = (short(row[name]) for name in ("difference", "low", "high"))
+        tests = " | ".join(f"{row[name]:.4f}" for name in ("p_value", "p_holm"))
+        lines.append(
+            f"| {row['env']} | {row['variant']} − {row['baseline']} | {row['seeds']} |"
+            f" {value} ({low} to {high}) | {tests} |"
+        )
     return lines
 
 
@@ -210,6 +224,15 @@ def readings(folder: Path) -> list[str]:
 
 def _claims(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "claims.json").read_text(encoding="utf-8")))
+
+
+def _comparisons(folder: Path, metric: str) -> pd.DataFrame:
+    """The rows of comparisons.csv on one metric."""
+    table = pd.read_csv(folder / "comparisons.csv")
+    table = table[table["metric"] == metric]
+    if table.empty:
+        sys.exit(f"show: {folder / 'comparisons.csv'} has no metric {metric!r}")
+    return table
 
 
 def _columns(folder: Path, cell: Callable[[pd.DataFrame], str]) -> list[str]:

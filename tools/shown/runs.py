@@ -11,7 +11,7 @@ from mace_rl import files
 from mace_rl.results.claims import stagnation_correlation
 from mace_rl.results.metrics import final_return
 from mace_rl.results.paper import FULL
-from tools import archive
+from tools import kept_runs
 from tools.shown.cells import SETTINGS, mean, number
 
 
@@ -31,10 +31,10 @@ def lowest(folder: Path, *environments: str) -> list[str]:
 def _of_each_seed(
     folder: Path, environments: Sequence[str], title: str, value: Callable[[np.ndarray], float]
 ) -> list[str]:
-    """A table of `value` of the learnt βs [episodes] of each seed."""
+    """A table of `value` of the learned βs [episodes] of each seed."""
     lines = [f"| | seeds | {title} |", "|---|---|---|"]
     for environment in environments:
-        runs = _learnt(folder, environment)
+        runs = _learned(folder, environment)
         found = sorted(value(episodes["beta"].to_numpy()) for episodes in runs)
         numbers = ", ".join(f"{beta:.2f}" for beta in found)
         lines.append(f"| {environment} | {len(found)} | {numbers} |")
@@ -42,7 +42,7 @@ def _of_each_seed(
 
 
 def stagnation(folder: Path, *environments: str) -> list[str]:
-    """The correlation of stagnation with the learnt β that follows (C9): mean over seeds."""
+    """The correlation of stagnation with the learned β that follows (C9): mean over seeds."""
     lines = ["| | seeds | correlation |", "|---|---|---|"]
     for environment in environments:
         found = pd.Series(
@@ -52,16 +52,16 @@ def stagnation(folder: Path, *environments: str) -> list[str]:
                     episodes["beta"].to_numpy(),
                     SETTINGS.moving_average,
                 )
-                for episodes in _learnt(folder, environment)
+                for episodes in _learned(folder, environment)
             ]
         )
         lines.append(f"| {environment} | {len(found)} | {mean(found, '.3f')} |")
     return lines
 
 
-def _learnt(folder: Path, environment: str) -> list[pd.DataFrame]:
-    """The episodes of the kept runs in which β was learnt, in the order of seeds."""
-    kept = archive.read(folder / environment / f"{FULL}.tar.xz")
+def _learned(folder: Path, environment: str) -> list[pd.DataFrame]:
+    """The episodes of the kept runs in which β was learned, in the order of seeds."""
+    kept = kept_runs.read(folder / environment / f"{FULL}.tar.xz")
     names = (name for name in kept if name.endswith(files.EPISODES))
     return [pd.read_csv(io.BytesIO(kept[name])) for name in names]
 

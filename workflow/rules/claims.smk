@@ -12,7 +12,7 @@ rule claims:
     log:
         f"{RESULTS}/logs/claims.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         command=COMMAND,
         code=code("claims.py", MEASURED),

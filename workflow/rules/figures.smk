@@ -15,7 +15,7 @@ rule curves:
     wildcard_constraints:
         number="1|2",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=study.metrics.model_dump(exclude={"custom"}),
         code=code("curves.py"),
     script:
@@ -59,7 +59,7 @@ rule pictures:
     log:
         f"{RESULTS}/logs/pictures.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,
@@ -84,7 +84,7 @@ if REGRET:
         log:
             f"{RESULTS}/logs/regret_figure.log",
         params:
-            runs=BUDGETS,
+            runs=TRAININGS,
             settings=MEASURED.model_dump(),
             labels=study.labels,
             colours=study.colours,
@@ -109,7 +109,7 @@ rule readings:
     log:
         f"{RESULTS}/logs/readings.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,

@@ -10,7 +10,7 @@ rule metrics:
     log:
         f"{RESULTS}/logs/metrics.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         code=code("metrics.py", MEASURED),
     script:

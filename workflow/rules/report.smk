@@ -33,7 +33,7 @@ rule page:
     log:
         f"{RESULTS}/logs/report.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,

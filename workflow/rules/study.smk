@@ -48,8 +48,8 @@ RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
 HAS_PAPERS = paper.has_all(study.environments, study.variants)
 TESTS_CLAIMS = HAS_PAPERS and bool(MEASURED.reference_return)
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
-# The regret of a learnt β only where the configuration asks for it.
 PICTURES = ["every_seed", "profiles"]
+# The regret of a learned β only where the configuration asks for it.
 REGRET = ["regret"] if study.metrics.regret else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = {key: value for key, value in given.items() if key != "results"}
@@ -59,7 +59,7 @@ COMMAND += (
     ["--config", *(f"{key}={json.dumps(value)}" for key, value in GIVEN.items())] if GIVEN else []
 )
 COMMAND = shlex.join(COMMAND)
-BUDGETS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # in episodes
+TRAININGS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # with how many episodes
 
 
 def one_of(values):

@@ -16,7 +16,7 @@ rule table1:
     log:
         f"{RESULTS}/logs/table1.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
         code=code("table1.py", MEASURED),
@@ -42,7 +42,7 @@ rule comparisons:
     log:
         f"{RESULTS}/logs/comparisons.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         code=code("comparisons.py", MEASURED),
     script:
@@ -69,7 +69,7 @@ rule aggregate:
     log:
         f"{RESULTS}/logs/aggregate.log",
     params:
-        runs=BUDGETS,
+        runs=TRAININGS,
         settings=MEASURED.model_dump(),
         code=code("aggregate.py", MEASURED),
     script:

@@ -38,7 +38,7 @@ def occupy(folder):
 
 def watched_runs():
     """Every run of the study, as what the terminal shows needs it."""
-    for env, variant, seed, episodes in BUDGETS:
+    for env, variant, seed, episodes in TRAININGS:
         wildcards = {"env": env, "variant": variant, "seed": str(seed)}
         work = most_work(SimpleNamespace(**wildcards))
         yield Run(*wildcards.values(), episodes, work, RUN.format(**wildcards))
@@ -58,7 +58,8 @@ onstart:
         logger.info(
             "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
         )
-    logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra={"study": watched})
+    told = {"study": watched, "quietness": Quietness.PROGRESS}
+    logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra=told)
 
 
 onsuccess:

@@ -1,4 +1,4 @@
-"""The mean return of training under every constant β, beside the learnt one."""
+"""The mean return of training under every constant β, beside the learned one."""
 
 from job import job
 

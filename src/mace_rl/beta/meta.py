@@ -37,11 +37,11 @@ class Judged:
 class MetaAdaptation(BetaController):
     """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
 
-    The update on episode n moves the policy along P g(β_n), with g the policy gradient of the total
-    advantage and P what Adam divides by. How the extrinsic return of the policies that result
+    The update on rollout n moves the policy along P g(β_n), with g the policy gradient of the total
+    advantage and P what Adam multiplies by. How the extrinsic return of the policies that result
     depends on β_n is therefore, up to a positive factor,
 
-        c_n = Σ_k ⟨g_E(θ_{n+k}; episode n+k), P dg/dβ_n (θ_n; episode n)⟩,   k = 1 … horizon.
+        c_n = Σ_k ⟨g_E(θ_{n+k}; rollout n+k), P dg/dβ_n (θ_n; rollout n)⟩,   k = 1 … horizon.
 
     Each term is measured in units of its usual size, with both vectors per unit of advantage, and
     counts as much as there is of extrinsic and of intrinsic advantage: where nothing is left to

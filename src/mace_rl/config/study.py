@@ -158,12 +158,14 @@ def load_study(config: Any, origin: str) -> Study:
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
-        for label, count in Counter(study.labels.values()).items():
-            if count > 1:
+        named: dict[str, str] = {}  # variants by label
+        for variant, label in study.labels.items():
+            if label in named:
                 raise ConfigError(
-                    f"variant_settings has the label {label!r} {count} times, but each of variants"
-                    " should have one of its own"
+                    f"variant_settings.{variant}.label is {label!r}, but so is that of "
+                    f"{named[label]}; each should have its own"
                 )
+            named[label] = variant
         for pair in study.metrics.comparisons:
             for variant in pair:
                 _check_known(

@@ -5,6 +5,7 @@ content security policy has the browser refuse whatever would be loaded.
 """
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ def page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "duration": duration, "value": _value}
+    environment.filters |= {"number": number, "short": short, "duration": duration, "value": _value}
     seeds = tables.metrics.groupby(["env", "variant"]).size()
     return environment.get_template(TEMPLATE.name).render(
         claims=_claims(tables.claims),
@@ -106,11 +107,7 @@ def page(
         no_common_bar=has_all(tables.metrics["env"], labels) and not settings.reference_return,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
-        few=[
-            env
-            for env, own in tables.metrics.groupby("env", sort=False)
-            if own["variant"].value_counts().min() < FEWEST_SEEDS
-        ],
+        few=_too_few(tables.claims),
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(seeds),
@@ -141,7 +138,7 @@ def page(
             tables.comparisons, pd.concat([tables.table1, tables.supplement]), settings
         ),
         supplement=_with_units(tables.supplement, tables.supplement, settings),
-        regret=None if tables.regret is None else tables.regret.to_dict("records"),
+        regret=_regret(tables, settings),
         costs=_costs(making.records, tables.metrics),
         total=_total(making.records),
         making=making,
@@ -156,6 +153,12 @@ def number(value: float | None, digits: int = 0) -> str:
     if value is None or np.isnan(value):
         return "–"
     return f"{value:z,.{digits}f}".replace(",", "\u202f").replace("-", "−")  # a narrow space
+
+
+def short(value: float) -> str:
+    """A return with three significant digits, or all that stand before the point."""
+    digits = 2 - math.floor(math.log10(abs(value))) if value else 0
+    return number(value, max(digits, 0))
 
 
 def duration(seconds: float) -> str:
@@ -206,6 +209,18 @@ def _counts(ledger: Mapping[str, Any] | None) -> dict[str, Counter[str]]:
     """How many claims have which verdict."""
     claims = ledger["claims"] if ledger else []
     return {how: Counter(claim[how]["verdict"] for claim in claims) for how in (LITERAL, ROBUST)}
+
+
+def _too_few(ledger: Mapping[str, Any] | None) -> list[str]:
+    """The environments in which a part of a claim has fewer seeds than the rule asks for."""
+    few = {
+        environment: None
+        for claim in (ledger["claims"] if ledger else [])
+        for part in claim[ROBUST]["parts"]
+        if part["seeds"] < FEWEST_SEEDS
+        for environment in part["environments"]
+    }
+    return list(few)
 
 
 def _table1(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -275,6 +290,17 @@ def _with_units(
             "digits": digits.get((row["env"], row["metric"]), 0),
         }
         for row in table.to_dict("records")
+    ]
+
+
+def _regret(tables: Tables, settings: MetricsConfig) -> list[dict[Any, Any]] | None:
+    """Rows with the digits that the supplement has for the same returns."""
+    if tables.regret is None:
+        return None
+    digits = digits_by_metric(tables.supplement, settings)
+    return [
+        row | {"digits": digits.get((row["env"], "area_under_curve"), 0)}
+        for row in tables.regret.to_dict("records")
     ]
 
 

@@ -1,7 +1,7 @@
 """All environments together: scores between random and the best run (Agarwal et al. 2021).
 
-The score of a run is (A - r₀) / (A* - r₀), where A is its mean return over all of training, r₀ the
-random policy's and A* the best run's of the study in that environment, of whichever variant.
+The score of a run is (A - r₀) / (A* - r₀), where A is its final return or its mean return over all
+of training, r₀ the random policy's and A* the best run's of the study in that environment.
 """
 
 from collections.abc import Callable, Sequence

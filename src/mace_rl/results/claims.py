@@ -1,7 +1,8 @@
 """Does what the paper claims hold? A verdict for each claim by the rule in docs/method.md.
 
 A claim is made of parts, each a comparison of two variants; a part holds, fails or is open, and the
-claim is reproduced, contradicted or inconclusive. Everything here was fixed before the study ran.
+claim is reproduced, contradicted or inconclusive. docs/method.md has the rule, and what was known
+when it was written.
 """
 
 from collections.abc import Mapping, Sequence

@@ -145,10 +145,10 @@ def convergence_steps(curve: LearningCurve) -> Episode:
     """
     settings, window = curve.settings, curve.settings.moving_average
     high = curve.average >= curve.bar(curve.final)
-    learnt = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
+    learned = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
     steepest = np.maximum.accumulate(curve.slopes)
     minimal = curve.slopes <= settings.convergence_slope * steepest
-    return curve.first(learnt & minimal & curve.learned, 2 * window)
+    return curve.first(learned & minimal & curve.learned, 2 * window)
 
 
 def convergence_steps_steepest(curve: LearningCurve) -> Episode:
@@ -180,7 +180,7 @@ def convergence_steps_public_code(curve: LearningCurve) -> Episode:
 
     The first 50-episode window past 30 % of training after which the moving average changes by less
     than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
-    first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learnt.
+    first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learned.
     """
     floor = int(PUBLIC_CODE_FLOOR * (len(curve.returns) - PUBLIC_CODE_WINDOW + 1))
     flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[floor:]) < PUBLIC_CODE_SLOPE

@@ -1,4 +1,4 @@
-"""Pictures of all runs at once: every seed, performance profiles, and the regret of a learnt β."""
+"""Pictures of all runs at once: every seed, performance profiles, and the regret of a learned β."""
 
 import math
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """What decides the ranking: Table 1 under every reading of its two metrics (docs/metrics.md).
 
 Beside the runs as they are stand the same runs with their returns in random order. Whoever is first
-there is first by chance and by how returns are distributed, since nothing is learnt in that order.
+there is first by chance and by how returns are distributed, since nothing is learned in that order.
 """
 
 import itertools

@@ -248,8 +248,8 @@ def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndar
 
     The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
     the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
-    a bootstrap over 10 seeds is too narrow otherwise (tools.coverage). With one seed, and where
-    one of `estimates` is NaN, NaN.
+    a bootstrap over 10 seeds is too narrow otherwise (tools.interval_coverage). With one seed, and
+    where one of `estimates` is NaN, NaN.
     """
     if seeds == 1:
         return np.full((2, *estimates.shape[1:]), np.nan)

@@ -26,7 +26,7 @@ MARGIN = 0.5
 
 
 class NotReproducedError(Refusal):
-    """A repeated run differs more than another machine explains."""
+    """Repeated runs are neither equal to the bit nor shown to do as well."""
 
 
 class Repetition(NamedTuple):
@@ -66,14 +66,15 @@ def repeat(run_folder: Path) -> Repetition:
         now = read_record(folder / files.RECORD)
         after = read_episodes(folder / files.EPISODES, config.episodes)
     different = (before != after).any(axis=1).to_numpy()
-    old, new = ({key: record[key] for key in ("arithmetic", "versions")} for record in (then, now))
-    same = old == new
-    for record, made in ((then, old), (now, new)):
-        made |= {"sources": record["sources"], "cpu": record["machine"]["cpu"]}
+    old, new = (
+        {key: record[key] for key in ("arithmetic", "versions", "sources")}
+        | {"cpu": record["machine"]["cpu"]}
+        for record in (then, now)
+    )
     return Repetition(
         name=f"{config.environment} {config.variant} seed {config.seed}",
         equal=then["outputs"] == now["outputs"],
-        same=same,
+        same=all(then[key] == now[key] for key in ("arithmetic", "versions")),
         first=int(different.argmax()) + 1 if different.any() else None,
         returns=(before["extrinsic_return"].mean(), after["extrinsic_return"].mean()),
         spread=before["extrinsic_return"].std(),
@@ -98,7 +99,7 @@ def verdict(results: Sequence[Repetition], confidence: float) -> tuple[bool, str
 
     Runs of other arithmetic or versions that differ are reproduced if the interval of the mean
     change of their returns, each in units of its run's spread over episodes, lies within `MARGIN`
-    on both sides of 0. Few runs have a wide interval: that they differ by chance is not assumed.
+    on both sides of 0. Few runs have a wide interval, which does not: agreement has to be shown.
     """
     different = [result for result in results if not result.equal]
     line = f"{len(results) - len(different)} of {len(results)} runs equal to the bit"

@@ -3,13 +3,14 @@
 import hashlib
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 from mace_rl import files
 from mace_rl.runs.provenance import KEYS
-from tools import archive, tables
+from tools import kept_runs, tables
 
 
 def make_run(folder: Path, text: str) -> None:
@@ -38,9 +39,9 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     for run in ("A-v1/ppo/seed0", "A-v1/ppo/seed10", "A-v1/ppo/seed9", "B-v0/mace_full/seed3"):
         make_run(results / "runs" / run, f"records of {run}\n" * 50)
     (results / "runs/A-v1/ppo/seed11").mkdir()  # not finished
-    assert archive.pack(results, kept) == 4
+    assert kept_runs.pack(results, kept) == 4
     assert sorted(content(kept)) == ["A-v1/ppo.tar.xz", "B-v0/mace_full.tar.xz"]
-    assert archive.unpack(kept, tmp_path / "again") == 4
+    assert kept_runs.unpack(kept, tmp_path / "again") == 4
     assert content(tmp_path / "again") == content(results)
     assert len([*(tmp_path / "again").rglob(files.AGENT)]) == 1
 
@@ -49,9 +50,9 @@ def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> N
     for half in (0, 1):
         make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", f"{half}\n")
         make_run(tmp_path / f"whole/runs/A-v1/ppo/seed{half}", f"{half}\n")
-    archive.pack(tmp_path / "half1", tmp_path / "kept")
-    assert archive.pack(tmp_path / "half0", tmp_path / "kept") == 2
-    archive.pack(tmp_path / "whole", tmp_path / "kept whole")
+    kept_runs.pack(tmp_path / "half1", tmp_path / "kept")
+    assert kept_runs.pack(tmp_path / "half0", tmp_path / "kept") == 2
+    kept_runs.pack(tmp_path / "whole", tmp_path / "kept whole")
     assert content(tmp_path / "kept") == content(tmp_path / "kept whole")
 
 
@@ -60,11 +61,23 @@ def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
     make_run(run, "1\n")
     (run / files.EPISODES).write_text("2\n")
     with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
-        archive.pack(tmp_path / "results", tmp_path / "kept")
+        kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     (run / files.EPISODES).write_text("1\n")
     (run / files.AGENT).write_text("another")
     with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
-        archive.pack(tmp_path / "results", tmp_path / "kept")
+        kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+
+
+def test_another_run_of_a_seed_that_is_kept_is_refused(tmp_path: Path) -> None:
+    run, kept = tmp_path / "results/runs/A-v1/ppo/seed0", tmp_path / "kept"
+    make_run(run, "1\n")
+    kept_runs.pack(tmp_path / "results", kept)
+    before = content(kept)
+    shutil.rmtree(run)
+    make_run(run, "2\n")
+    with pytest.raises(ValueError, match=r"ppo\.tar\.xz has another run of this seed"):
+        kept_runs.pack(tmp_path / "results", kept)
+    assert content(kept) == before
 
 
 @pytest.mark.parametrize("command", ["pack", "unpack"])
@@ -75,18 +88,18 @@ def test_where_there_are_no_runs_nothing_is_done(
     origin, goal = tmp_path / folder, tmp_path / "goal"
     (tmp_path / "without a finished run/runs/A-v1/ppo/seed0").mkdir(parents=True)
     make_run(tmp_path / "results/runs/A-v1/ppo/seed1", "1\n")
-    archive.pack(tmp_path / "results", goal)  # what is there already does not count
+    kept_runs.pack(tmp_path / "results", goal)  # what is there already does not count
     before = content(tmp_path)
     wanted = {"pack": "runs/ENV/VARIANT/seedN/run.json", "unpack": "ENV/VARIANT.tar.xz"}[command]
-    monkeypatch.setattr("sys.argv", ["archive", command, str(origin), str(goal)])
+    monkeypatch.setattr("sys.argv", ["kept_runs", command, str(origin), str(goal)])
     with pytest.raises(SystemExit) as ended:
-        archive.main()
-    assert ended.value.code == f"archive: {origin}: no {wanted} in it"
+        kept_runs.main()
+    assert ended.value.code == f"kept_runs: {origin}: no {wanted} in it"
     assert content(tmp_path) == before
 
 
 def test_the_example_packs_where_the_tables_are_made_from() -> None:
     packed, unpacked = re.findall(
-        r"(?m)^    \S+ -m tools\.archive .* (\S+) (\S+)$", archive.__doc__
+        r"(?m)^    \S+ -m tools\.kept_runs .* (\S+) (\S+)$", kept_runs.__doc__
     )
     assert Path(packed[1]) == Path(unpacked[0]) == tables.KEPT

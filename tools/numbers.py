@@ -1,6 +1,6 @@
 """README and docs say what the kept results say: the text between marks is what a command prints.
 
-    .venv/bin/python -m tools.printed [--check]        (make numbers)
+    .venv/bin/python -m tools.numbers [--check]        (make numbers)
 
 A mark is `<!-- python -m tools.show WHAT FOLDER ... -->`; its text, to `<!-- end -->`, is what that
 prints. With --check nothing is written, and a text that says something else is a mistake.
@@ -38,7 +38,7 @@ def printed(command: str) -> str:
 def main() -> None:
     """Entry point; exits with 1 if a page says something else and --check is given."""
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="example: python -m tools.printed --check"
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.numbers --check"
     )
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check
@@ -47,7 +47,7 @@ def main() -> None:
         text = page.read_text(encoding="utf-8")
         if len(MARKED.findall(text)) != text.count(MARK):
             sys.exit(
-                f"numbers: {page.relative_to(ROOT)}: a mark has no text with an end of its own"
+                f"numbers: {page.relative_to(ROOT)}: not each {MARK}… --> has its <!-- end -->"
             )
 
         def renew(mark: re.Match[str], page: Path = page) -> str:

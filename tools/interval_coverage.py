@@ -1,6 +1,6 @@
 """How often do the intervals of the tables hold the true value? By simulation.
 
-    .venv/bin/python -m tools.coverage [REPEATS]
+    .venv/bin/python -m tools.interval_coverage [REPEATS]
 
 For 10 and 20 seeds and several distributions over seeds: the share of REPEATS (2000) simulated
 studies whose nominal 95 % interval holds the truth, in %, for the mean, the interquartile mean and
@@ -68,10 +68,10 @@ def main(repeats: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="example: python -m tools.coverage 500"
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.interval_coverage 500"
     )
     parser.add_argument("repeats", type=int, nargs="?", default=2000, help="(default: 2000)")
     count = parser.parse_args().repeats
     if count < 1:
-        sys.exit(f"coverage: REPEATS is {count}, but should be at least 1")
+        sys.exit(f"interval_coverage: REPEATS is {count}, but should be at least 1")
     main(count)

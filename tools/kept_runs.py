@@ -1,7 +1,7 @@
 """Keep finished runs small, or put kept ones back: exact, one file per environment and variant.
 
-    .venv/bin/python -m tools.archive pack RESULTS ARCHIVE      results/study reference/study
-    .venv/bin/python -m tools.archive unpack ARCHIVE RESULTS    reference/study results/study
+    .venv/bin/python -m tools.kept_runs pack RESULTS ARCHIVE      results/study reference/study
+    .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS    reference/study results/study
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
 what is not kept; of seed0 the agent too, which the report shows at play.
@@ -105,7 +105,7 @@ def main() -> None:
     commands = {"pack": pack, "unpack": unpack}
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog="example: python -m tools.archive pack results reference/study",
+        epilog="example: python -m tools.kept_runs pack results reference/study",
     )
     parser.add_argument("command", choices=commands)
     parser.add_argument("origin", type=Path, help="RESULTS to pack, or the ARCHIVE to unpack")
@@ -114,7 +114,7 @@ def main() -> None:
     try:
         count = commands[arguments.command](arguments.origin, arguments.goal)
     except (ValueError, OSError, tarfile.TarError, lzma.LZMAError) as error:
-        sys.exit(f"archive: {error}")
+        sys.exit(f"kept_runs: {error}")
     print(f"{count} runs in {arguments.goal}")
 
 
