@@ -21,7 +21,7 @@ from mace_rl import files
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import read_study
 from mace_rl.report.animations import animations
-from mace_rl.report.page import Making, _costs, _table1, duration, number, read_tables
+from mace_rl.report.page import Making, number, read_tables
 from mace_rl.report.page import page as build
 from mace_rl.report.workflow_graph import graph
 from mace_rl.results.claims import LITERAL, ROBUST
@@ -321,62 +321,3 @@ def test_a_rule_stands_right_of_what_it_needs() -> None:
     assert len({(node.x, node.y) for node in drawn.nodes}) == len(needs)
     assert len(drawn.curves) == 4  # not from a to c, as b is between
     assert {node.rule: node.note for node in drawn.nodes}["a"] == "3 runs"
-
-
-def test_the_lowest_mean_is_marked_but_never_that_of_seeds_that_all_failed() -> None:
-    means = {"a": (10.4, 0), "b": (10.0, 1), "c": (11.6, 0), "d": (10.0, 3)}
-    shared = {"env": "A-v0", "metric": "sample_efficiency", "seeds": 3, "paper": pd.NA}
-    rows = [
-        {"variant": name, "mean": mean, "censored": censored} | shared
-        for name, (mean, censored) in means.items()
-    ]
-    (block,) = _table1(pd.DataFrame(rows))
-    assert {name: cells[0]["best"] for name, cells in block["rows"].items()} == {
-        "a": True,
-        "b": True,
-        "c": False,
-        "d": False,
-    }
-
-
-def test_costs_are_of_all_runs_of_a_variant() -> None:
-    records = [
-        {
-            "config": {"environment": "A-v0", "variant": variant, "seed": seed},
-            "seconds": 10.0**seed * (1 + (variant == "full")),
-            "peak_memory_mb": 300 + seed,
-        }
-        for variant in ("ppo", "full")
-        for seed in range(3)
-    ]
-    runs = [record["config"] for record in records]
-    metrics = pd.DataFrame(runs).rename(columns={"environment": "env"}).assign(env_steps=7)
-    plain, full = _costs(records, metrics[::-1])
-    assert plain == {
-        "env": "A-v0",
-        "variant": "ppo",
-        "runs": 3,
-        "steps": 21,
-        "median": 10,
-        "longest": 100,
-        "seconds": 111,
-        "memory": 302,
-    }
-    assert (full["variant"], full["seconds"]) == ("full", 222)
-
-
-def test_numbers_as_they_are_printed() -> None:
-    assert [
-        number(-0.4),
-        number(-1.25, 1),
-        number(1234567),
-        number(float("nan")),
-        number(None),
-    ] == [
-        "0",
-        "−1.2",
-        "1\u202f234\u202f567",
-        "–",
-        "–",
-    ]
-    assert [duration(0.04), duration(90), duration(7200)] == ["0.0 s", "1.5 min", "2.0 h"]

@@ -107,7 +107,7 @@ def page(
         no_common_bar=has_all(tables.metrics["env"], labels) and not settings.reference_return,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
-        few=_too_few(tables.claims),
+        few=_too_few(tables.claims, tables.metrics["env"].unique()),
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(seeds),
@@ -211,16 +211,16 @@ def _counts(ledger: Mapping[str, Any] | None) -> dict[str, Counter[str]]:
     return {how: Counter(claim[how]["verdict"] for claim in claims) for how in (LITERAL, ROBUST)}
 
 
-def _too_few(ledger: Mapping[str, Any] | None) -> list[str]:
-    """The environments in which a part of a claim has fewer seeds than the rule asks for."""
+def _too_few(ledger: Mapping[str, Any] | None, environments: Iterable[str]) -> list[str]:
+    """Those of the environments in which a claim's part has fewer seeds than the rule asks for."""
     few = {
-        environment: None
+        environment
         for claim in (ledger["claims"] if ledger else [])
         for part in claim[ROBUST]["parts"]
         if part["seeds"] < FEWEST_SEEDS
         for environment in part["environments"]
     }
-    return list(few)
+    return [environment for environment in environments if environment in few]
 
 
 def _table1(table: pd.DataFrame) -> list[dict[str, Any]]:
