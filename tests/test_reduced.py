@@ -17,9 +17,10 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import read_study
 from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
-from mace_rl.results.tables import table1, table1_latex
+from mace_rl.results.tables import table1
 from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]

@@ -15,17 +15,11 @@ from invented import table_for_tables
 
 from mace_rl.config.run import PPOConfig, TorchModule
 from mace_rl.config.study import read_study
+from mace_rl.results.latex import escaped, supplement_latex, table1_latex, table2_latex
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1
 from mace_rl.results.paper import VARIANTS as PAPER_VARIANTS
-from mace_rl.results.tables import (
-    latex,
-    supplement,
-    supplement_latex,
-    table1,
-    table1_latex,
-    table2_latex,
-)
+from mace_rl.results.tables import supplement, table1
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
@@ -268,7 +262,7 @@ def test_table2_has_the_papers_rows_then_ours():
 
 
 def test_special_characters_are_escaped_once():
-    assert latex(r"a_b & 50 % β ~ \x {1} #2 $3^4 λ") == (
+    assert escaped(r"a_b & 50 % β ~ \x {1} #2 $3^4 λ") == (
         r"a\_b \& 50 \% $\beta$ \textasciitilde{} \textbackslash{}x \{1\} \#2"
         r" \$3\textasciicircum{}4 $\lambda$"
     )

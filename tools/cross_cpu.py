@@ -134,7 +134,7 @@ def tabulate(folder: Path) -> None:
 
     from mace_rl.cli import CONFIG
     from mace_rl.config.study import read_study
-    from mace_rl.results import figures, tables
+    from mace_rl.results import figures, latex, tables
     from mace_rl.results.metrics_table import metrics_table
     from mace_rl.results.records import read_episodes
 
@@ -147,8 +147,8 @@ def tabulate(folder: Path) -> None:
     table = tables.table1(metrics_table(frames, list(frames), settings), settings)
     folder.mkdir(parents=True)
     (folder / "table1.csv").write_text(table.to_csv(index=False), encoding="utf-8")
-    latex = tables.table1_latex(table, study.labels, settings)
-    (folder / "table1.tex").write_text(latex, encoding="utf-8")
+    fragment = latex.table1_latex(table, study.labels, settings)
+    (folder / "table1.tex").write_text(fragment, encoding="utf-8")
     shown = figures.quantity("1", settings)
     seeds = figures.seed_curves(frames, shown)
     curves = figures.mean_curves(seeds, shown, settings)
