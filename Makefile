@@ -1,8 +1,9 @@
 # From a clean clone to the paper's table and figure. `make help` lists what there is.
 # Every target sets up .venv first, which is silent and instant when there is nothing to do.
 
+# Makes .venv; one that is there keeps the Python that it was made with.
 PYTHON ?= python3.11
-# How many jobs run at once: a number, or all the machine has.
+# How many jobs, or processes of tests, run at once: a number, or all the machine has.
 CORES ?= all
 
 SHELL := bash
@@ -20,7 +21,7 @@ unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET P
 IN_VENV := PATH="$$PWD/.venv/bin:$$PATH" .venv/bin/python -m
 SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
 # Each process of the tests takes some 400 MB. What shares a finished study stays in one of them.
-PYTEST := $(IN_VENV) pytest -n auto --maxprocesses 8 --dist loadgroup
+PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxprocesses 8 --dist loadgroup
 
 # $(call one_of,NAME,VALUE): stop where the variable has another value.
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
@@ -90,10 +91,11 @@ PROJECT := .venv/project-$(call digest,pyproject.toml)
 INSTALL := .venv/bin/python -m pip install --no-deps --no-build-isolation --no-compile
 
 setup: ## only create .venv from environment.lock
-	@[ ! -e $(PACKAGES) ] || [ ! -e $(PROJECT) ] || exit 0
+	@[ -e .venv/bin/python ] || rm -f .venv/packages-* .venv/project-* # its Python may be gone
+	[ ! -e $(PACKAGES) ] || [ ! -e $(PROJECT) ] || exit 0
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || {
-	    echo "This needs Python 3.11, and '$(PYTHON)' is not: install it (Debian, Ubuntu: apt install" \
-	        "python3.11 python3.11-venv) or name one: make PYTHON=/path/to/python3.11" >&2
+	    echo "This needs Python 3.11, and '$(PYTHON)' is not: install it (Debian 12: apt install python3.11" \
+	        "python3.11-venv; elsewhere pyenv or uv have it) or name one: make PYTHON=/path/to/python3.11" >&2
 	    exit 1
 	}
 	echo "Setting up .venv (once: a minute, or several GB if pip finds no CPU build of torch) ..." >&2

@@ -1,6 +1,7 @@
 """docs/performance.md from the measurements: its pictures, and its tables between markers."""
 
 import re
+import sys
 
 import pandas as pd
 
@@ -13,6 +14,8 @@ def measure_all(scale: Scale) -> None:
     """Write the document and the pictures of the data in `scale.data`, and summary.csv."""
     names = ("results", "breakdown", "growth", "workflow", "planning", "start", "wrapper")
     names += ("purejaxrl", "arithmetic", "update")
+    if missing := [name for name in names if not (scale.data / f"{name}.csv").exists()]:
+        sys.exit(f"report: not measured yet: {', '.join(missing)} (in {scale.data})")
     data = [pd.read_csv(scale.data / f"{name}.csv") for name in names]
     results, times, growth, jobs, planning, starts, costs, peers, prices, one_update = data
     summary = speed_summary(results)

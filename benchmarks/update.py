@@ -71,13 +71,13 @@ def parts() -> dict[str, tuple[Callable[[], Any], Callable[[], list[Any]]]]:
     from mace_rl.agent.adam import adam
 
     @kernels.kernel
-    def by_library(inputs, weights, grad, outputs, grad_inputs, grad_weights):  # type: ignore[no-untyped-def]
+    def by_library(inputs, weights, grad, outputs, grad_inputs, grad_weights):
         np.dot(inputs, weights, outputs)
         np.dot(grad, weights.T, grad_inputs)
         np.dot(inputs.T, grad, grad_weights)
 
     @kernels.kernel
-    def multiply(a, b, out):  # type: ignore[no-untyped-def]
+    def multiply(a, b, out):
         # One order of sums, whatever the processor; eight terms for each pass over a row of `out`.
         out[:] = 0
         whole = a.shape[1] - a.shape[1] % 8
@@ -95,7 +95,7 @@ def parts() -> dict[str, tuple[Callable[[], Any], Callable[[], list[Any]]]]:
                     row[j] += a[n, k] * b[k, j]
 
     @kernels.kernel
-    def by_loops(inputs, weights, grad, outputs, grad_inputs, grad_weights):  # type: ignore[no-untyped-def]
+    def by_loops(inputs, weights, grad, outputs, grad_inputs, grad_weights):
         multiply(inputs, weights, outputs)
         multiply(grad, np.ascontiguousarray(weights.T), grad_inputs)
         multiply(inputs.T, grad, grad_weights)

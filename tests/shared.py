@@ -19,6 +19,7 @@ from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork
 from mace_rl.agent.policy import Policy
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
+from mace_rl.files import LOCK
 from mace_rl.train import Trainer
 
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
@@ -106,7 +107,8 @@ class Killed(BaseException):
 
 
 def files(directory: Path) -> list[str]:
-    return sorted(path.name for path in directory.iterdir())
+    """Those of a run but for its lock, which stays."""
+    return sorted({path.name for path in directory.iterdir()} - {LOCK})
 
 
 def provenance_of(directory: Path) -> dict:

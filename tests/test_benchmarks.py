@@ -3,6 +3,7 @@
 import importlib
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -211,6 +212,13 @@ def test_report_is_written_from_the_data(data):
         assert f"]({picture}.png)" in text
     with pytest.raises(ValueError, match="0 places for 'speed'"):
         report.filled("no markers here", {"speed": "a table"})
+
+
+def test_a_report_of_what_was_not_measured_is_refused(tmp_path: Path) -> None:
+    scale = replace(QUICK, data=tmp_path)
+    (tmp_path / "results.csv").touch()
+    with pytest.raises(SystemExit, match=r"report: not measured yet: breakdown, growth, .*update "):
+        report.measure_all(scale)
 
 
 def test_stopwatch_books_nested_time_once_and_what_raises(monkeypatch):

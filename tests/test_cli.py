@@ -10,7 +10,7 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from shared import GOOD, call
+from shared import GOOD, call, files
 from snakemake.utils import update_config
 
 from mace_rl import cli
@@ -231,7 +231,7 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     options = sum((GOOD | {"--out": str(out)}).items(), ())
     assert call(monkeypatch, "train", *options) == (0, "")
     results = {"agent.pt", "diagnostics.csv", "episodes.csv", "run.json"}
-    assert {path.name for path in out.iterdir()} == results
+    assert set(files(out)) == results
     records = (out / "episodes.csv").read_bytes()
     assert call(monkeypatch, "train", *options) == (0, "")
     assert "finished" in caplog.text

@@ -27,6 +27,7 @@ from shared import (
     finish,
 )
 
+from mace_rl.files import LOCK
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs import provenance, run
 from mace_rl.train import Trainer
@@ -116,7 +117,7 @@ def test_a_process_killed_by_sigkill_is_resumed_by_another(
 
 def test_a_dying_predecessor_is_waited_for(tmp_path):
     """It holds the folder's lock for a moment after whoever started it is gone."""
-    holder = os.open(tmp_path, os.O_RDONLY)
+    holder = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
     fcntl.flock(holder, fcntl.LOCK_EX)
     timer = threading.Timer(0.5, os.close, [holder])
     started = time.monotonic()

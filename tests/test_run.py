@@ -111,7 +111,7 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
         command = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e", *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
+    monkeypatch.setattr(provenance.sources, "PACKAGE", tmp_path)
     assert provenance.git_state() == {"commit": None, "dirty": None}
     git("init")
     (tmp_path / "code.py").write_text("1\n")
@@ -218,3 +218,16 @@ def test_identity_covers_every_module_that_training_imports(run_config, monkeypa
     monkeypatch.setattr(Path, "read_bytes", lambda path: (covered.add(path), read(path))[1])
     run.run_identity(run_config(ppo={"network": LAYER_NORM}))
     assert imported | {Path(__file__).with_name("shared.py")} <= covered
+
+
+def test_the_peak_of_memory_is_this_process_s_and_not_that_of_who_started_it() -> None:
+    child = "from mace_rl.runs.provenance import peak_memory_mb; print(peak_memory_mb())"
+    parent = (
+        "import subprocess, sys; much = bytearray(600 << 20); print(len(much) >> 20, flush=True);"
+        f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", parent], capture_output=True, text=True, check=True
+    )
+    held, peak = map(float, done.stdout.split())
+    assert held == 600 and 5 < peak < 400

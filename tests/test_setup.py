@@ -159,11 +159,13 @@ def test_setup_adds_the_cuda_packages_for_the_torch_that_asks_for_them(checkout)
     assert code != 0, "the packages are still missing, says the stub"
 
 
-@pytest.mark.parametrize("change", [*LOCKS, "pyproject.toml", "the folder"])
+@pytest.mark.parametrize("change", [*LOCKS, "pyproject.toml", "the folder", "its Python"])
 def test_what_has_changed_is_made_anew(checkout, change):
     make(checkout)
     if change == "the folder":
         checkout = checkout.rename(checkout.with_name("moved"))
+    elif change == "its Python":
+        (checkout / ".venv/bin/python").unlink()  # as where a link has lost what it leads to
     else:
         (checkout / change).write_text("# changed\n" + (ROOT / change).read_text())
     code, _, calls = make(checkout)

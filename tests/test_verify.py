@@ -11,7 +11,7 @@ import pytest
 from shared import GOOD, call
 
 from mace_rl.runs import verify
-from mace_rl.runs.verify import NotReproducedError, Repetition, verdict
+from mace_rl.runs.verify import NotReproducedError, Repetition, _made_with, verdict
 
 
 @pytest.fixture
@@ -107,6 +107,22 @@ def test_damaged_references_are_refused(damage, reference, monkeypatch):
     damage(reference / "runs/CartPole-v1/ppo/seed0")
     code, message = call(monkeypatch, "verify", str(reference))
     assert code == 1 and str(reference) in message and "\n" not in message
+
+
+def test_any_python_of_a_minor_version_and_nothing_else_counts_as_the_same() -> None:
+    record = {"arithmetic": {"blas": "a"}, "versions": {"python": "3.11.7", "numpy": "2.4.6"}}
+
+    def other(section: str, **values: str) -> dict[str, dict[str, str]]:
+        return record | {section: record[section] | values}
+
+    made = _made_with(record)
+    assert made == _made_with(other("versions", python="3.11.13"))
+    for different in (
+        other("versions", python="3.12.7"),
+        other("versions", numpy="2.4.7"),
+        other("arithmetic", blas="b"),
+    ):
+        assert made != _made_with(different)
 
 
 def test_verify_counts_agreement_by_hand():

@@ -190,7 +190,10 @@ def kill_workflows(scratch: Path) -> list[bool]:
             process.wait()
             time.sleep(3)  # jobs of a killed Snakemake notice and end
         cut = [path.parent for path in results.glob(CHECKPOINTS) if cut_off(path.parent)]
-        again = subprocess.run(command, **quiet, check=False)
+        again = subprocess.run(command, **quiet | {"stderr": subprocess.PIPE}, check=False)
+        if not sent and again.returncode:
+            end = again.stderr.decode(errors="replace").strip().splitlines()[-3:]
+            sys.exit("kill test: the undisturbed workflow failed: " + " ".join(end))
         found[name] = contents(results)
         if sent:
             equal = again.returncode == 0 and found[name] == found["none"]

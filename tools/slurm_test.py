@@ -31,7 +31,8 @@ from mace_rl import files
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGURATION = Path("/etc/slurm/slurm.conf")
-PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "squeue", "scancel", "scontrol")
+DAEMONS = ("munged", "slurmctld", "slurmd")
+PROGRAMS = (*DAEMONS, "sbatch", "srun", "squeue", "scancel", "scontrol", "sinfo")
 SIGN = f"# Written by {Path(__file__).name}, which takes it away again."
 PATIENCE = 60.0  # seconds for daemons to start, and for jobs to end
 
@@ -40,7 +41,7 @@ STUDY = ["all", "--configfile", "config/reduced.yaml", "--config"]
 STUDY += ["environment_settings={HopperBulletEnv-v0: {episodes: 500}}"]
 CHECKPOINTS = {"MACE_RL_CHECKPOINT_SECONDS": "1"}
 # In place of the profile's numbers, so that long runs, too, share entries in a study this small:
-# all 12 short ones are an entry, and every two of the 6 of Hopper.
+# the 14 shortest are an entry, and every two of Hopper's 4 with a bonus.
 SMALL_ENTRIES = ["--group-components", "runs_18=18", "runs_2=2"]
 HASTE = ["--slurm-init-seconds-before-status-checks", "5", "--seconds-between-status-checks", "5"]
 LONG = "HopperBulletEnv-v0"  # its trainings last long enough for a checkpoint

@@ -14,8 +14,6 @@ from mace_rl.config.plugins import source_file
 from mace_rl.config.run import RunConfig
 from mace_rl.refusal import Refusal
 
-PACKAGE = Path(__file__).parents[1]
-
 # The packages whose version can change a result.
 PACKAGES = (
     "torch",
@@ -58,7 +56,7 @@ def git_state() -> dict[str, Any]:
     """Commit and whether tracked files differ from it; both None outside a git checkout."""
 
     def git(*arguments: str) -> str:
-        command = ["git", "-C", str(PACKAGE), *arguments]
+        command = ["git", "-C", str(sources.PACKAGE), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
@@ -68,6 +66,17 @@ def git_state() -> dict[str, Any]:
         }
     except (FileNotFoundError, subprocess.CalledProcessError):  # no git, or no repository
         return {"commit": None, "dirty": None}
+
+
+def peak_memory_mb() -> float:
+    """The most resident memory, in MiB, that this process has had.
+
+    Not `ru_maxrss`, which begins at the peak of the process that started this one.
+    """
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return next(
+        int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM:")
+    )
 
 
 def cpu_model() -> str:

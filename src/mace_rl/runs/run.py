@@ -10,7 +10,6 @@ import json
 import logging
 import math
 import os
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -193,7 +192,8 @@ def between_checkpoints() -> float:
 @contextmanager
 def exclusive(directory: Path) -> Iterator[None]:
     """Hold the run's folder for this process; the lock goes with the process, however it ends."""
-    descriptor = os.open(directory, os.O_RDONLY)
+    # A file of its own: a folder on a network's disk can be locked by two machines at once.
+    descriptor = os.open(directory / files.LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         patience = time.monotonic() + LOCK_SECONDS
         while not locked(descriptor):
@@ -206,7 +206,7 @@ def exclusive(directory: Path) -> Iterator[None]:
 
 
 def locked(descriptor: int) -> bool:
-    """Try to lock an open folder for this process."""
+    """Try to lock an open file for this process."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -246,7 +246,6 @@ def write_results(
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
     agent = checkpoint.archive(Agent(trainer.ppo).state_dict())
     write_atomically(directory / files.AGENT, agent)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux
     origin = identity | {
         "code": provenance.git_state(),
         "machine": provenance.machine(),
@@ -255,7 +254,7 @@ def write_results(
         "start_seconds": clock.start_seconds,
         "checkpoint_seconds": clock.checkpoint_seconds,
         "interruptions": interruptions,
-        "peak_memory_mb": peak / 1024,
+        "peak_memory_mb": provenance.peak_memory_mb(),
         "outputs": {name: provenance.file_digest(directory / name) for name in files.RESULTS},
     }
     write_atomically(
