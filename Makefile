@@ -45,7 +45,7 @@ tables: setup ## the tables, figures and verdicts of reference/studies.yaml from
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
 
 numbers: setup ## write what the tables of reference/ say into README and docs
-	@$(IN_VENV) tools.numbers
+	@$(IN_VENV) tools.printed_numbers
 
 report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)

@@ -17,7 +17,7 @@ from tools import (
     interval_coverage,
     kept_runs,
     meta_signal,
-    numbers,
+    printed_numbers,
 )
 from tools.shown import results, runs
 
@@ -28,7 +28,7 @@ def test_the_pages_say_what_the_kept_tables_say(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
-    numbers.main()
+    printed_numbers.main()
     said = capsys.readouterr().out
     assert said.endswith("marked texts, 0 differ\n")
     assert int(said.split()[0]) >= 5
@@ -43,27 +43,27 @@ def test_a_number_that_is_not_printed_is_refused_and_mended(
     page.write_text(
         "<!-- python -m tools.show means reference/tables/baseline -->\n9\n<!-- end -->"
     )
-    monkeypatch.setattr(numbers, "ROOT", tmp_path)
+    monkeypatch.setattr(printed_numbers, "ROOT", tmp_path)
     monkeypatch.setattr("sys.argv", ["numbers", "--check"])
     with pytest.raises(SystemExit, match=r"README\.md: means reference/tables/baseline"):
-        numbers.main()
+        printed_numbers.main()
     assert "\n9\n" in page.read_text()
     monkeypatch.setattr("sys.argv", ["numbers"])
-    numbers.main()
+    printed_numbers.main()
     assert "| Acrobot-v1 | ppo | 20 |" in page.read_text()
     page.write_text("<!-- python -m tools.show means reference/none -->\n<!-- end -->")
     with pytest.raises(SystemExit, match="reference/none"):
-        numbers.main()
+        printed_numbers.main()
     mark = "<!-- python -m tools.show means reference/tables/baseline -->"
     for text in (f"{mark}\nwords\n{mark}\n<!-- end -->\n", f"{mark}\n", f"{mark} 9\n<!-- end -->"):
         page.write_text(text)
         with pytest.raises(SystemExit, match=r"README\.md: not each .* has its <!-- end -->"):
-            numbers.main()
+            printed_numbers.main()
         assert page.read_text() == text
 
 
 def test_the_study_page_has_no_decimal_or_count_of_its_own() -> None:
-    text = numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
+    text = printed_numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
 

@@ -1,6 +1,6 @@
 """README and docs say what the kept results say: the text between marks is what a command prints.
 
-    .venv/bin/python -m tools.numbers [--check]        (make numbers)
+    .venv/bin/python -m tools.printed_numbers [--check]        (make numbers)
 
 A mark is `<!-- python -m tools.show WHAT FOLDER ... -->`; its text, to `<!-- end -->`, is what that
 prints. With --check nothing is written, and a text that says something else is a mistake.
@@ -38,7 +38,8 @@ def printed(command: str) -> str:
 def main() -> None:
     """Entry point; exits with 1 if a page says something else and --check is given."""
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="example: python -m tools.numbers --check"
+        description=__doc__.splitlines()[0],
+        epilog="example: python -m tools.printed_numbers --check",
     )
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check
