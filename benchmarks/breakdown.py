@@ -124,7 +124,7 @@ def instrument(trainer: Any, watch: Stopwatch) -> None:
         watch.wrap(section, import_module(module), name)
     if trainer.environment.name != HOPPER:
         # One compiled loop, of environment and acting; `profile` tells them apart.
-        watch.wrap("acting", trainer, "rollout")
+        watch.wrap("acting", trainer, "play")
 
 
 def compiled_step_seconds(environment: str) -> float:
