@@ -15,8 +15,9 @@ from mace_rl.bonus.hashing import HashCounts
 from mace_rl.bonus.icm import IntrinsicCuriosityModule
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.rnd import RandomNetworkDistillation
+from mace_rl.config.bonus import HashCountsBonus, ICMBonus, RNDBonus
 from mace_rl.config.reading import merge_layers
-from mace_rl.config.run import HashCountsBonus, ICMBonus, RNDBonus, RunConfig
+from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import Study, read_study
 from mace_rl.environments.rollout import Episode

@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from shared import environment_of, finish
 
 from mace_rl.beta.controls import RandomDraw, SlidingWindowBandit
-from mace_rl.config.run import BanditBeta
+from mace_rl.config.beta import BanditBeta
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode

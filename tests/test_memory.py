@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mace_rl.bonus.memory import EpisodicMemory, Recollection
-from mace_rl.config.run import MemoryConfig
+from mace_rl.config.bonus import MemoryConfig
 from mace_rl.nearest import nearest
 
 ORIGIN, UNIT = torch.zeros(3), torch.ones(3)  # the identity as an embedding

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.novelty import CountNovelty, DensityNovelty
-from mace_rl.config.run import NoveltyConfig
+from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.streams import Streams
 
 SIZE = 3

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from mace_rl.beta.schedule import ExponentialSchedule
-from mace_rl.config.run import ExponentialBeta
+from mace_rl.config.beta import ExponentialBeta
 
 
 def test_exponential_schedule_by_hand():

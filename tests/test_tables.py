@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 from invented import table_for_tables
 
-from mace_rl.config.run import PPOConfig, TorchModule
+from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.study import read_study
 from mace_rl.results.latex import escaped, supplement_latex, table1_latex, table2_latex
 from mace_rl.results.metrics import Metric, all_metrics

@@ -17,7 +17,8 @@ from mace_rl.beta.controller import BetaController
 from mace_rl.beta.controls import RandomDraw
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.novelty import Novelty
-from mace_rl.config.run import MemoryConfig, NoveltyConfig, RandomBeta
+from mace_rl.config.beta import RandomBeta
+from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.wrappers import MEMORY, NOVELTY
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from mace_rl.agent.advantages import normalised, normalised_change, root_mean_square
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.config.run import ConstantBeta
+from mace_rl.config.beta import ConstantBeta
 from mace_rl.config.section import ConfigError
 from mace_rl.experience import (
     Experience,

@@ -14,7 +14,7 @@ from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.stepwise import StepwiseCuriosity
-from mace_rl.config.run import BanditBeta, CustomBeta
+from mace_rl.config.beta import BanditBeta, CustomBeta
 from mace_rl.config.section import ConfigError, short
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode

@@ -17,24 +17,20 @@ from mace_rl.bonus.hashing import HashCounts
 from mace_rl.bonus.icm import IntrinsicCuriosityModule
 from mace_rl.bonus.intrinsic import IntrinsicReward
 from mace_rl.bonus.rnd import RandomNetworkDistillation
-from mace_rl.config.plugins import make
-from mace_rl.config.run import (
+from mace_rl.config.agent import DictionaryValue
+from mace_rl.config.beta import (
     BanditBeta,
     BetaRule,
     ConstantBeta,
-    CuriosityBonus,
     CustomBeta,
-    CustomBonus,
-    DictionaryValue,
     ExponentialBeta,
-    HashCountsBonus,
-    ICMBonus,
     MetaBeta,
     NoBonus,
     RandomBeta,
-    RNDBonus,
-    RunConfig,
 )
+from mace_rl.config.bonus import CuriosityBonus, CustomBonus, HashCountsBonus, ICMBonus, RNDBonus
+from mace_rl.config.plugins import make
+from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.streams import Streams
 

@@ -3,7 +3,7 @@
 from job import job
 
 with job("Table 2", snakemake.log[0]):
-    from mace_rl.config.run import PPOConfig
+    from mace_rl.config.agent import PPOConfig
     from mace_rl.files import write_atomically
     from mace_rl.results.latex import table2_latex
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.ppo import Batch
-from mace_rl.config.run import DictionaryValue
+from mace_rl.config.agent import DictionaryValue
 from mace_rl.nearest import nearest
 
 # States closer than this are the same: mean squared difference in standard deviations. It is what

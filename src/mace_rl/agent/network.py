@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from mace_rl.agent import kernels
+from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.plugins import make
-from mace_rl.config.run import PPOConfig, TorchModule
 from mace_rl.config.section import ConfigError
 
 

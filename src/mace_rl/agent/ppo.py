@@ -15,7 +15,7 @@ from mace_rl.agent.network import Network
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
-from mace_rl.config.run import PPOConfig
+from mace_rl.config.agent import PPOConfig
 
 # Steps that go through a network at once in an update. Arrays for many more would not fit into the
 # processor's cache, and the system takes back their memory after each use: a quarter more time for

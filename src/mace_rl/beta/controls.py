@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mace_rl.beta.controller import BetaController
-from mace_rl.config.run import BanditBeta, RandomBeta
+from mace_rl.config.beta import BanditBeta, RandomBeta
 from mace_rl.environments.rollout import Episode
 
 

@@ -16,7 +16,7 @@ from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.beta.controller import BetaController, Effect
 from mace_rl.beta.lstm import meta_network
 from mace_rl.beta.progress import Progress
-from mace_rl.config.run import MetaConfig
+from mace_rl.config.beta import MetaConfig
 from mace_rl.environments.rollout import Episode
 
 STATE_CLIP = 10.0  # bound of what the LSTM reads of a state, in standard deviations

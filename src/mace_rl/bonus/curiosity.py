@@ -10,7 +10,7 @@ from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.bonus.novelty import novelty
-from mace_rl.config.run import MemoryConfig, NoveltyConfig
+from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.streams import Streams
 

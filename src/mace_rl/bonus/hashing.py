@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Discrete
 
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
-from mace_rl.config.run import HashCountsBonus
+from mace_rl.config.bonus import HashCountsBonus
 from mace_rl.environments.rollout import Episode
 
 

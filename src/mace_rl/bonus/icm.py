@@ -7,7 +7,7 @@ from torch.nn.functional import log_softmax
 
 from mace_rl.agent.network import TorchNetwork, mlp
 from mace_rl.bonus.intrinsic import PredictionError
-from mace_rl.config.run import ICMBonus
+from mace_rl.config.bonus import ICMBonus
 from mace_rl.environments.rollout import Episode
 
 

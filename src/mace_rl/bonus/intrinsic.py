@@ -14,7 +14,7 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.network import Network
 from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.config.run import ICMBonus, RNDBonus
+from mace_rl.config.bonus import ICMBonus, RNDBonus
 from mace_rl.environments.rollout import Episode
 
 CLIP = 5.0  # bound of whitened observations, in standard deviations (Burda et al. 2018, 2.4)

@@ -7,7 +7,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from mace_rl.config.run import MemoryConfig
+from mace_rl.config.bonus import MemoryConfig
 from mace_rl.nearest import nearest
 
 

@@ -10,8 +10,8 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.density import DensityEstimator
+from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.config.plugins import make
-from mace_rl.config.run import NoveltyConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.finite import require_finite
 from mace_rl.nearest import nearest

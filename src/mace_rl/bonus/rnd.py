@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Discrete
 
 from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, mlp
 from mace_rl.bonus.intrinsic import PredictionError
-from mace_rl.config.run import RNDBonus
+from mace_rl.config.bonus import RNDBonus
 from mace_rl.environments.rollout import Episode
 
 

@@ -5,8 +5,9 @@ from typing import Any
 
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
+from mace_rl.config.beta import BetaRule
+from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import merge
-from mace_rl.config.run import BetaRule, MemoryConfig, NoveltyConfig
 from mace_rl.config.section import Section
 
 # The study's; `config.yaml` says whose each value is.

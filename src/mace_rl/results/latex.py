@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.config.results import MetricsConfig
-from mace_rl.config.run import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.results.metrics import Metric
 from mace_rl.results.paper import PAPER_METRICS
 from mace_rl.results.statistics import BOOTSTRAP_SEEDS, interval_kind

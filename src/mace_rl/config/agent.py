@@ -1,0 +1,87 @@
+"""Settings of `mace_rl.agent`: networks, critics and PPO."""
+
+from typing import Any, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from mace_rl.config.section import Reference, Section
+
+
+class CompiledNetwork(Section):
+    """A tanh network of `hidden_units`, compiled."""
+
+    kind: Literal["mlp"]
+
+
+class TorchModule(Section):
+    """Any torch module: what `module` returns for (inputs, outputs, hidden_units, **arguments)."""
+
+    kind: Literal["torch"]
+    module: Reference
+    arguments: dict[str, Any] = Field(default={})
+
+
+NetworkConfig = CompiledNetwork | TorchModule
+
+
+class NetworkValue(Section):
+    """A critic that is a network, as the policy is."""
+
+    kind: Literal["network"]
+
+    def __str__(self) -> str:
+        return "network"
+
+
+class DictionaryValue(Section):
+    """A critic that is a dictionary of states and returns (Pritzel et al. 2017)."""
+
+    kind: Literal["dictionary"]
+    capacity: PositiveInt  # states
+    neighbours: PositiveInt  # k, whose returns make a value
+    kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
+    learning_rate: PositiveFloat = Field(le=1)  # α, at which a remembered state's return moves
+
+    def __str__(self) -> str:
+        return f"dictionary of {self.capacity} states"
+
+    @model_validator(mode="after")
+    def _neighbours_fit(self) -> "DictionaryValue":
+        if self.neighbours > self.capacity:
+            raise ValueError(
+                f"neighbours is {self.neighbours}, which must not exceed capacity, {self.capacity}"
+            )
+        return self
+
+
+CriticConfig = NetworkValue | DictionaryValue
+
+
+class PPOConfig(Section):
+    """Proximal Policy Optimization (paper, Table 2; Schulman et al. 2017)."""
+
+    actor_learning_rate: PositiveFloat = Field(lt=1)
+    critic_learning_rate: PositiveFloat = Field(lt=1)
+    discount: float = Field(ge=0, le=1)  # γ
+    epochs: PositiveInt  # K, passes over the rollout at each update
+    clip: PositiveFloat = Field(lt=1)  # ε
+    gae_lambda: float = Field(ge=0, le=1)  # λ; 1 is the Monte Carlo return minus the baseline
+    entropy_coefficient: NonNegativeFloat
+    # An update follows the first episode end at which this many steps have been collected, so 1
+    # is one update per episode. Rollouts are whole episodes: β belongs to an episode.
+    rollout_steps: PositiveInt
+    minibatch_size: PositiveInt | None  # None: the whole rollout is one batch
+    network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
+    hidden_units: list[PositiveInt] = Field(min_length=1)
+    critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
+    initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
+    max_gradient_norm: PositiveFloat
+    normalise_observations: bool
+    # Rewards are divided by the running standard deviation of their discounted sums; extrinsic ones
+    # by at least 1, lest tiny costs be blown up.
+    scale_rewards: bool
+    # Extrinsic and intrinsic advantages are each divided by their running root mean square before β
+    # weighs them, extrinsic ones by at least `smallest_advantage`: β is then a relative strength.
+    scale_advantages: bool
+    smallest_advantage: PositiveFloat
+    centre_advantages: bool  # subtract the rollout's mean from total advantages

@@ -1,0 +1,105 @@
+"""Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from mace_rl.config.section import Reference, Section
+
+
+class MetaConfig(Section):
+    """Meta-adaptation network: the LSTM that sets β (paper, supplement)."""
+
+    hidden_units: PositiveInt
+    learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
+    max_gradient_norm: PositiveFloat
+    horizon: PositiveInt  # updates after an episode that judge its β
+    prior: NonNegativeFloat  # pull of β's logit back to the initial β's, per unit of distance
+    max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
+    max_sequence: PositiveInt | None  # longer episodes are condensed to this many elements
+
+
+class NoBonus(Section):
+    """Plain PPO: no curiosity, no memory, β = 0."""
+
+    kind: Literal["none"]
+
+
+class ConstantBeta(Section):
+    """The same β in every episode."""
+
+    kind: Literal["constant"]
+    value: float = Field(ge=0, le=1)
+
+
+class RandomBeta(Section):
+    """β uniform between `low` and `high`, drawn for every episode."""
+
+    kind: Literal["random"]
+    low: float = Field(ge=0, le=1)
+    high: float = Field(ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "RandomBeta":
+        if self.low > self.high:
+            raise ValueError(f"low is {self.low}, which must not exceed high, {self.high}")
+        return self
+
+
+class BanditBeta(Section):
+    """β from a bandit that follows the returns (Badia et al. 2020, appendix D)."""
+
+    kind: Literal["bandit"]
+    arms: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=1)  # the βs to choose from
+    window: PositiveInt  # pulls that count, the last ones
+    exploration: NonNegativeFloat  # of the bonus √(1 / pulls), in ranges of the return
+    epsilon: float = Field(ge=0, le=1)  # probability of an arm at random
+
+    @model_validator(mode="after")
+    def _arms_fit(self) -> "BanditBeta":
+        if len(set(self.arms)) < len(self.arms):
+            raise ValueError(f"arms has a β twice: {self.arms}")
+        if self.window < len(self.arms):
+            raise ValueError(
+                f"window is {self.window}, which must hold each of the {len(self.arms)} arms"
+            )
+        return self
+
+
+class ExponentialBeta(Section):
+    """β_n = max(floor, initial · decay^(n-1)) for episode n = 1, 2, …"""
+
+    kind: Literal["exponential"]
+    initial: float = Field(ge=0, le=1)
+    decay: PositiveFloat = Field(le=1)
+    floor: float = Field(ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _falls(self) -> "ExponentialBeta":
+        if self.floor > self.initial:
+            raise ValueError(
+                f"floor is {self.floor}, which must not exceed initial, {self.initial}"
+            )
+        return self
+
+
+class MetaBeta(Section):
+    """β from the meta-adaptation network; `initial` is β of the first episode."""
+
+    kind: Literal["meta"]
+    initial: float = Field(gt=0, lt=1)
+
+
+class CustomBeta(Section):
+    """β from the class `rule`, a `mace_rl.beta.controller.BetaController`.
+
+    It is made as rule(generator, **arguments).
+    """
+
+    kind: Literal["custom"]
+    rule: Reference
+    arguments: dict[str, Any] = Field(default={})
+
+
+BetaRule = ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | CustomBeta
+BetaConfig = NoBonus | MetaBeta | BetaRule

@@ -1,0 +1,112 @@
+"""Settings of `mace_rl.bonus`: memory, novelty, and the bonuses that can be had."""
+
+from typing import Any, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from mace_rl.config.section import Reference, Section
+
+
+class MemoryConfig(Section):
+    """Episodic memory: a differentiable neural dictionary (paper, supplement)."""
+
+    capacity: PositiveInt  # entries
+    neighbours: PositiveInt  # k of the top-k lookup
+    kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
+    write_every: PositiveInt  # one step in this many is written
+
+    @model_validator(mode="after")
+    def _neighbours_fit(self) -> "MemoryConfig":
+        if self.neighbours > self.capacity:
+            raise ValueError(
+                f"neighbours is {self.neighbours}, which must not exceed capacity, {self.capacity}"
+            )
+        return self
+
+
+class NoveltyConfig(Section):
+    """Novelty: visitation counts (Discrete observations) or k-NN and density (Box)."""
+
+    # auto: by the observation space; custom: the class `estimator` gets (size, generator,
+    # **arguments), with what mace_rl.bonus.novelty.Novelty asks for.
+    kind: Literal["auto", "counts", "density", "custom"] = "auto"
+    estimator: Reference | None = None
+    arguments: dict[str, Any] = Field(default={})
+    count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
+    buffer_size: PositiveInt  # visited states that k-NN and density refer to, a cover of ...
+    write_every: PositiveInt  # ... one in so many
+    neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
+    calibration_states: PositiveInt  # a sample of them says what distance is usual
+    knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
+    density_hidden_units: PositiveInt
+    density_learning_rate: PositiveFloat = Field(lt=1)
+    density_batch_size: PositiveInt
+    density_steps: PositiveInt  # gradient steps of the density estimator after each episode
+
+    @model_validator(mode="after")
+    def _neighbours_fit(self) -> "NoveltyConfig":
+        if max(self.neighbours) >= self.buffer_size:
+            raise ValueError(
+                f"neighbours has {max(self.neighbours)}, which must be less than buffer_size,"
+                f" {self.buffer_size}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _estimator_if_custom(self) -> "NoveltyConfig":
+        if (self.kind == "custom") != (self.estimator is not None):
+            raise ValueError("estimator and kind: custom go together")
+        if self.arguments and self.kind != "custom":
+            raise ValueError("arguments are those of an estimator, with kind: custom")
+        return self
+
+
+class CuriosityBonus(Section):
+    """Curiosity: novelty × memory relevance (paper); without `relevance`, novelty alone."""
+
+    kind: Literal["curiosity"]
+    relevance: bool = True
+
+
+class ICMBonus(Section):
+    """Intrinsic curiosity module (Pathak et al. 2017): `mace_rl.bonus.icm`."""
+
+    kind: Literal["icm"]
+    feature_units: PositiveInt = 32  # numbers in φ(s); the paper has 288 for images
+    hidden_units: PositiveInt = 64  # of the one hidden layer in each of its three networks
+    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper's
+    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+    forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
+    scale: PositiveFloat = 1.0  # η
+
+
+class RNDBonus(Section):
+    """Random network distillation (Burda et al. 2018): `mace_rl.bonus.rnd`."""
+
+    kind: Literal["rnd"]
+    feature_units: PositiveInt = 64  # outputs of both networks; the paper has 512 for images
+    hidden_units: PositiveInt = 64  # of the one hidden layer in each
+    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper has 0.0001, for images
+    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+
+
+class HashCountsBonus(Section):
+    """Counts of hashed states (Tang et al. 2017): `mace_rl.bonus.hashing`."""
+
+    kind: Literal["hash_counts"]
+    bits: int = Field(default=16, ge=1, le=62)  # k; more tell more states apart
+    calibration_states: PositiveInt = 1000  # the first visited; states are hashed in their units
+
+
+class CustomBonus(Section):
+    """A bonus from the class `estimator`, a `mace_rl.bonus.intrinsic.IntrinsicReward`.
+
+    It is made as estimator(size, action_space, generator, **arguments).
+    """
+
+    kind: Literal["custom"]
+    estimator: Reference
+    arguments: dict[str, Any] = Field(default={})
+
+
+BonusConfig = CuriosityBonus | ICMBonus | RNDBonus | HashCountsBonus | CustomBonus
