@@ -71,6 +71,14 @@ def test_a_library_that_was_loaded_before_is_noticed(
     assert f"not {EXPECTED[library]}, because it was loaded before" in result.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("package", ["tools.tables", "tools.show", "benchmarks.tables"])
+def test_what_a_checkout_runs_chooses_before_numpy_is_loaded(package: str) -> None:
+    # A type that every processor has: what reads it before it is chosen computes with it.
+    code = f"import {package}\nfrom mace_rl.arithmetic import in_use\nprint(in_use()['blas'])"
+    assert python(code, OPENBLAS_CORETYPE="Nehalem").stdout.split() == [EXPECTED["blas"]]
+
+
 def test_a_processor_without_avx2_gets_one_line_and_a_way_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
