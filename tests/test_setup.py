@@ -214,10 +214,20 @@ def test_lock_splits_the_resolution_and_keeps_the_hash_of_torchs_cpu_build(check
 
 
 def test_workflow_lint_accepts_only_the_missing_conda_environment(tmp_path):
-    (tmp_path / "Snakefile").write_text("rule a:\n    output: 'a'\n    shell: 'touch {output}'\n")
+    snakefile = tmp_path / "Snakefile"
     command = [sys.executable, ROOT / "tools" / "lint_workflow.py"]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert (run.returncode, run.stderr) == (1, "rule a: No log directive defined\n")
+
+    def lint(rule: str) -> tuple[int, str]:
+        snakefile.write_text(f"rule a:\n    output: 'a'\n{rule}    shell: 'touch {{output}}'\n")
+        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        return run.returncode, run.stderr
+
+    assert lint("    log: 'b'\n") == (0, "")
+    of_the_file = f'{snakefile}: Absolute path "/b" in line 3\n'
+    of_the_rule = "rule a: No log directive defined\n"
+    assert lint("    input: '/b'\n") == (1, of_the_file + of_the_rule)
+    code, said = lint("    logs: 'b'\n")
+    assert code == 1 and "Unexpected keyword logs" in said, "no rule could be read"
 
 
 def test_make_help_lists_every_target():
