@@ -134,7 +134,7 @@ def test_one_panel_per_environment_shows_the_data():
     curves, _ = data()
     figure = draw()
     assert [axes.get_title() for axes in figure.axes] == ["A-v0", "B-v1"]
-    assert figure.axes[0].get_ylabel() == "Extrinsic return\n(mean of 5 episodes)"
+    assert figure.axes[0].get_ylabel() == "Extrinsic return\n(mean of up to 5 episodes)"
     assert {axes.get_xlabel() for axes in figure.axes} == {"Training episodes"}
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == list(LABELS.values())

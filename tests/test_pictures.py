@@ -65,7 +65,7 @@ def test_every_run_is_a_dot_of_its_variants_colour() -> None:
     figure = pictures.draw_every_seed(frame, NAMES, COLOURS)
     panels = {axes.get_title(): axes for axes in figure.axes}
     assert len(panels) == len(SEEDS) * len(SCORED)
-    axes = panels["CartPole-v1: final return"]
+    axes = panels["CartPole-v1:\nfinal return"]
     own = frame[frame["env"] == "CartPole-v1"]
     for dots, variant in zip(axes.collections[::2], ("ppo", "mace_full"), strict=True):
         values = own.loc[own["variant"] == variant, "final_return"]
@@ -79,7 +79,7 @@ def test_the_regret_shows_constants_as_a_line_and_others_beside_it(study: Study)
     frame = pd.concat([frame, constant.assign(area_under_curve=100.0)], ignore_index=True)
     regret = RegretConfig(variant="mace_full", constants=["ppo", "beta_1"])
     names, colours = NAMES | {"beta_1": "β = 1"}, COLOURS | {"beta_1": "black"}
-    figure = pictures.draw_regret(frame, regret, study.metrics, names, colours)
+    figure = pictures.draw_regret(frame, regret, study.figure, study.metrics, names, colours)
     (axes,) = figure.axes
     joined = next(line for line in axes.lines if len(line.get_xdata()) == 2)
     means = frame.groupby("variant")["area_under_curve"].mean()
@@ -93,7 +93,7 @@ def test_the_regret_of_seeds_that_are_all_equal_can_be_drawn(study: Study) -> No
     """A bound of 20 times 0.1 differs from the mean in the last bit."""
     frame = table_for_scores({"CartPole-v1": 20}).assign(area_under_curve=0.1)
     regret = RegretConfig(variant="mace_full", constants=["ppo"])
-    figure = pictures.draw_regret(frame, regret, study.metrics, NAMES, COLOURS)
+    figure = pictures.draw_regret(frame, regret, study.figure, study.metrics, NAMES, COLOURS)
     assert len(figure.axes[0].collections) == 2
 
 
@@ -102,7 +102,7 @@ def test_a_picture_is_the_same_file_again(study: Study, tmp_path) -> None:
     curves = pictures.profiles(frame, study.metrics)
     files = [tmp_path / name for name in ("a.png", "b.png", "a.pdf", "b.pdf")]
     for path in files:
-        save_figure(pictures.draw_profiles(curves, NAMES, COLOURS), path)
+        save_figure(pictures.draw_profiles(curves, 0.95, NAMES, COLOURS), path)
     contents = [path.read_bytes() for path in files]
     assert contents[0] == contents[1]
     assert contents[2] == contents[3]

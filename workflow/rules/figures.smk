@@ -85,6 +85,7 @@ if REGRET:
             f"{RESULTS}/logs/regret_figure.log",
         params:
             runs=TRAININGS,
+            layout=study.figure.model_dump(),
             settings=MEASURED.model_dump(),
             labels=study.labels,
             colours=study.colours,

@@ -19,7 +19,7 @@ with job("pictures", snakemake.log[0]):
     write_atomically(snakemake.output.profiles, curves.to_csv(index=False))
     figures = {
         "every_seed": pictures.draw_every_seed(table, *names),
-        "profiles": pictures.draw_profiles(curves, *names),
+        "profiles": pictures.draw_profiles(curves, settings.confidence, *names),
     }
     for path in snakemake.output:
         if path != snakemake.output.profiles:

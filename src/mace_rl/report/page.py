@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.colors import to_hex
 
-from mace_rl.config.results import MetricsConfig
+from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.report.animations import Animations
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
@@ -256,10 +256,10 @@ def _pictures(
     drawn = {
         "readings": draw_readings(tables.readings, labels, colours, settings),
         "every_seed": draw_every_seed(tables.metrics, labels, colours),
-        "profiles": draw_profiles(tables.profiles, labels, colours),
+        "profiles": draw_profiles(tables.profiles, settings.confidence, labels, colours),
     }
     if settings.regret:
-        how = settings.regret, settings, labels, colours
+        how = settings.regret, FigureConfig(columns=3), settings, labels, colours
         drawn["regret"] = draw_regret(tables.metrics, *how)
     return {name: svg(figure, name, name.replace("_", " ")) for name, figure in drawn.items()}
 

@@ -49,7 +49,7 @@ def quantity(figure: str, settings: MetricsConfig) -> Quantity:
     if figure == "2":
         return Quantity("beta", 1, "beta", "β", limits=(0, 1), zero_is_shown=False)
     window = settings.moving_average
-    label = f"Extrinsic return\n(mean of {window} episodes)"
+    label = f"Extrinsic return\n(mean of up to {window} episodes)"
     return Quantity("extrinsic_return", window, "moving_average", label)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig, RegretConfig
+from mace_rl.config.results import FigureConfig, MetricsConfig, RegretConfig
 from mace_rl.results.aggregate import SCORED, scores
 from mace_rl.results.figures import LEGEND_HEIGHT, PANEL_HEIGHT, WIDTH, style
 from mace_rl.results.metrics import METRICS
@@ -47,7 +47,10 @@ def profiles(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 
 def draw_profiles(
-    curves: pd.DataFrame, labels: Mapping[str, str], colours: Mapping[str, str]
+    curves: pd.DataFrame,
+    confidence: float,
+    labels: Mapping[str, str],
+    colours: Mapping[str, str],
 ) -> "Figure":
     """A panel per metric from `profiles`; a curve that lies higher belongs to better runs."""
     from matplotlib.figure import Figure
@@ -66,7 +69,7 @@ def draw_profiles(
             axes.set_xlabel("Score τ (0: random, 1: the best run)")
             axes.set_ylim(0, 1.02)
         panels[0].set_ylabel("Share of runs ≥ τ")
-        _legend(figure, panels[0])
+        _legend(figure, panels[0], f"Band: {100 * confidence:g} % interval.")
     return figure
 
 
@@ -79,7 +82,7 @@ def draw_every_seed(
     environments, variants = list(table["env"].unique()), list(table["variant"].unique())
     jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(table))
     with style():
-        height = len(environments) * PANEL_HEIGHT * 0.8 + LEGEND_HEIGHT
+        height = len(environments) * PANEL_HEIGHT * 0.9 + LEGEND_HEIGHT
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         grid = figure.subplots(len(environments), len(SCORED), squeeze=False)
         for environment, row in zip(environments, grid, strict=True):
@@ -93,7 +96,7 @@ def draw_every_seed(
                     dots.set(alpha=0.7, linewidth=0, label=labels[variant])
                     axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colours[variant])
                 axes.set_xticks([])
-                axes.set_title(f"{environment}: {LABELS[metric].lower()}")
+                axes.set_title(f"{environment}:\n{LABELS[metric].lower()}")
         _legend(figure, grid[0, 0], "Dot: one seed. Line: their mean.")
     return figure
 
@@ -101,6 +104,7 @@ def draw_every_seed(
 def draw_regret(
     table: pd.DataFrame,
     regret: RegretConfig,
+    layout: FigureConfig,
     settings: MetricsConfig,
     labels: Mapping[str, str],
     colours: Mapping[str, str],
@@ -114,7 +118,7 @@ def draw_regret(
 
     environments = list(table["env"].unique())
     others = [name for name in table["variant"].unique() if name not in regret.constants]
-    columns = min(3, len(environments))
+    columns = min(layout.columns, len(environments))
     rows = math.ceil(len(environments) / columns)
     with style():
         height = rows * PANEL_HEIGHT * 1.1 + LEGEND_HEIGHT
@@ -151,7 +155,11 @@ def draw_regret(
             axes.remove()
         for axes in panels[: len(environments) : columns]:
             axes.set_ylabel("Mean return of training")
-        _legend(figure, panels[0])
+        _legend(
+            figure,
+            panels[0],
+            f"Dot: mean over seeds. Bar: its {100 * settings.confidence:g} % interval.",
+        )
     return figure
 
 

@@ -266,6 +266,7 @@ def draw_readings(
             unique.keys(),
             loc="outside lower center",
             ncols=min(len(unique), 4),
-            title="Dot: mean over seeds, with its interval. Hollow: the paper.",
+            title=f"Dot: mean over seeds. Bar: its {100 * settings.confidence:g} % interval. "
+            "Hollow: the paper.",
         )
     return figure
