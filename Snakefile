@@ -23,9 +23,8 @@ localrules:
     table2,
     comparisons,
     aggregate,
-    curves,
     figure,
-    pictures,
+    picture,
     readings,
     page,
 
@@ -46,8 +45,12 @@ rule all:
         f"{RESULTS}/figure2.pdf",
         f"{RESULTS}/figure2.png",
         f"{RESULTS}/figure2.csv",
-        *[f"{RESULTS}/{picture}.{kind}" for picture in PICTURES + REGRET for kind in ("pdf", "png")],
-        f"{RESULTS}/profiles.csv",
+        *[f"{RESULTS}/{name}.csv" for name in REGRET],
+        *[
+            f"{RESULTS}/{picture}.{kind}"
+            for picture in (PICTURES + ["forest"] if CLAIMS else PICTURES)
+            for kind in ("csv", "pdf", "png")
+        ],
         f"{RESULTS}/readings.csv",
         f"{RESULTS}/readings.md",
         f"{RESULTS}/readings.pdf",

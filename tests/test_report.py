@@ -185,7 +185,7 @@ def test_figures_have_a_panel_for_each_environment(page: Page) -> None:
     assert "PPO (Baseline)" not in page.words("beta")
     assert [one["aria-label"] for one in page.all("ranking", "svg")] == ["readings"]
     shown = [one["aria-label"] for one in page.all("statistics", "svg")]
-    assert shown == ["every seed", "profiles"]
+    assert shown == ["every seed"]
     assert "returns shuffled" in page.words("ranking")
 
 
@@ -240,8 +240,7 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, tmp_path: Pa
     )
     results = made / "results"
     found = {name: results / f"{name}.csv" for name in ("metrics", "table1", "supplement")}
-    found |= {name: results / f"{name}.csv" for name in ("comparisons", "aggregate")}
-    found |= {name: results / f"{name}.csv" for name in ("profiles", "readings")}
+    found |= {name: results / f"{name}.csv" for name in ("comparisons", "aggregate", "readings")}
     for figure in "12":
         found |= {f"curves{figure}": results / f"figure{figure}.csv"}
         found |= {f"seeds{figure}": results / f"figure{figure}_seeds.csv"}

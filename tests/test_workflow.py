@@ -35,13 +35,13 @@ OUTPUTS = [
     *("metrics.csv", "comparisons.csv", "aggregate.csv", "table1.tex", "table1.csv", "table2.tex"),
     *("supplement.tex", "supplement.csv", "figure1.csv", "figure1_seeds.csv", "figure2.csv"),
     *("figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"),
-    *("every_seed.pdf", "every_seed.png", "profiles.csv", "profiles.pdf", "profiles.png"),
+    *("every_seed.csv", "every_seed.pdf", "every_seed.png"),
     *("readings.csv", "readings.md", "readings.pdf", "readings.png"),
     *(f"{run}/{name}" for run in RUNS for name in ("episodes.csv", "diagnostics.csv", "agent.pt")),
 ]
 EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1}
-EVALUATION |= {"curves": 2, "figure": 2, "pictures": 1, "readings": 1}
-DRAWN = {"figure": 2, "pictures": 1, "readings": 1}
+DRAWN = {"figure": 2, "picture": 1, "readings": 1}
+EVALUATION |= DRAWN
 
 
 class Project:
@@ -200,15 +200,12 @@ CHANGES = {  # of a file, from one text to another, and what is to be done then
     "code of PPO": ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN),
     "code of the LSTM": ("src/mace_rl/beta/lstm.py", "\n", "\n\n", TRAIN),
     "code of tables": ("src/mace_rl/results/tables.py", "\n", "\n\n", {"table1": 1, "table2": 1}),
-    "code of figures": (
-        *("src/mace_rl/results/figures.py", "\n", "\n\n"),
-        {"curves": 2, "figure": 2, "pictures": 1, "readings": 1},
-    ),
+    "code of figures": ("src/mace_rl/results/figures.py", "\n", "\n\n", DRAWN),
     "code of progress": ("src/mace_rl/runs/progress.py", "\n", "\n\n", {}),
     "a script": ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
     "a result": (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),
-        {"table1": 1, "comparisons": 1, "aggregate": 1, "pictures": 1},
+        {"table1": 1, "comparisons": 1, "aggregate": 1, "picture": 1},
     ),
 }
 
@@ -227,7 +224,7 @@ def test_a_colour_redraws_the_figures_and_touches_nothing_else(finished: Project
     edit("config.yaml", "tab:green", "tab:olive")
     assert finished("snakemake -j2 all")[0] == 0
     changed = {name for name, value in finished.digests().items() if value != before[name]}
-    drawn = ("figure1", "figure2", "every_seed", "profiles", "readings")
+    drawn = ("figure1", "figure2", "every_seed", "readings")
     assert changed == {f"{name}.{kind}" for name in drawn for kind in ("pdf", "png")}
     edit("config.yaml", "tab:olive", "tab:green")
     assert finished("snakemake -j1 all")[0] == 0

@@ -48,8 +48,8 @@ EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 PAGE = "report.html"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
-    *("metrics", "table1", "table2", "comparisons", "aggregate", "curves", "figure", "claims"),
-    *("pictures", "regret_figure", "readings", "page"),
+    *("metrics", "table1", "table2", "comparisons", "aggregate", "figure", "claims"),
+    *("picture", "forest", "readings", "page"),
 )
 
 

@@ -1,32 +1,16 @@
-# Figures over training, each drawn from its data alone: 1 is the paper's, 2 shows β.
+# Pictures, each with its data beside it as CSV.
 
 
-rule curves:
+# Over training: 1 is the paper's, 2 shows β.
+rule figure:
     input:
         episodes=EPISODES,
         records=RECORDS,
     output:
         curves=report(
-            f"{RESULTS}/figure{{number}}.csv", caption="../report/curves.rst", category="Results"
+            f"{RESULTS}/figure{{number}}.csv", caption="../report/figure.rst", category="Results"
         ),
         single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
-    log:
-        f"{RESULTS}/logs/curves{{number}}.log",
-    wildcard_constraints:
-        number="1|2",
-    params:
-        runs=TRAININGS,
-        settings=study.metrics.model_dump(exclude={"custom"}),
-        code=code("curves.py"),
-    script:
-        "../scripts/curves.py"
-
-
-rule figure:
-    input:
-        curves=f"{RESULTS}/figure{{number}}.csv",
-        single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
-    output:
         pdf=f"{RESULTS}/figure{{number}}.pdf",
         png=report(
             f"{RESULTS}/figure{{number}}.png", caption="../report/figure.rst", category="Results"
@@ -36,6 +20,7 @@ rule figure:
     wildcard_constraints:
         number="1|2",
     params:
+        runs=TRAININGS,
         layout=study.figure.model_dump(),
         settings=study.metrics.model_dump(exclude={"custom"}),
         labels=study.labels,
@@ -45,53 +30,41 @@ rule figure:
         "../scripts/figure.py"
 
 
-rule pictures:
+# Of all runs at once: `PICTURES` of mace_rl.results.pictures.
+rule picture:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        report(
-            [f"{RESULTS}/{picture}.png" for picture in PICTURES],
-            caption="../report/pictures.rst",
-            category="Supplement",
+        data=f"{RESULTS}/{{picture}}.csv",
+        pdf=f"{RESULTS}/{{picture}}.pdf",
+        png=report(
+            f"{RESULTS}/{{picture}}.png", caption="../report/picture.rst", category="Results"
         ),
-        [f"{RESULTS}/{picture}.pdf" for picture in PICTURES],
-        profiles=f"{RESULTS}/profiles.csv",
     log:
-        f"{RESULTS}/logs/pictures.log",
+        f"{RESULTS}/logs/{{picture}}.log",
+    wildcard_constraints:
+        picture="|".join(PICTURES),
     params:
         runs=TRAININGS,
+        layout=study.figure.model_dump(),
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,
-        code=code("pictures.py", MEASURED),
+        code=code("picture.py", MEASURED),
     script:
-        "../scripts/pictures.py"
+        "../scripts/picture.py"
 
 
-if REGRET:
+if CLAIMS:
 
     localrules:
-        regret_figure,
+        forest,
 
-    rule regret_figure:
+    use rule picture as forest with:
         input:
-            f"{RESULTS}/metrics.csv",
-        output:
-            pdf=f"{RESULTS}/regret.pdf",
-            png=report(
-                f"{RESULTS}/regret.png", caption="../report/regret.rst", category="Supplement"
-            ),
-        log:
-            f"{RESULTS}/logs/regret_figure.log",
-        params:
-            runs=TRAININGS,
-            layout=study.figure.model_dump(),
-            settings=MEASURED.model_dump(),
-            labels=study.labels,
-            colours=study.colours,
-            code=code("regret_figure.py", MEASURED),
-        script:
-            "../scripts/regret_figure.py"
+            CLAIMS[0],
+        wildcard_constraints:
+            picture="forest",
 
 
 rule readings:

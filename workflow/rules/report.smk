@@ -9,7 +9,6 @@ REPORTED = {
     "supplement": f"{RESULTS}/supplement.csv",
     "comparisons": f"{RESULTS}/comparisons.csv",
     "aggregate": f"{RESULTS}/aggregate.csv",
-    "profiles": f"{RESULTS}/profiles.csv",
     "readings": f"{RESULTS}/readings.csv",
     **{f"curves{number}": f"{RESULTS}/figure{number}.csv" for number in "12"},
     **{f"seeds{number}": f"{RESULTS}/figure{number}_seeds.csv" for number in "12"},

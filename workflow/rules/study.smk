@@ -48,9 +48,11 @@ RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
 HAS_PAPERS = paper.has_all(study.environments, study.variants)
 TESTS_CLAIMS = HAS_PAPERS and bool(MEASURED.reference_return)
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
-PICTURES = ["every_seed", "profiles"]
 # The regret of a learned β only where the configuration asks for it.
 REGRET = ["regret"] if study.metrics.regret else []
+PICTURES = ["every_seed"]  # and what the configuration has the numbers for
+PICTURES += ["constants"] if MEASURED.regret else []
+PICTURES += ["solved"] if MEASURED.solved_return else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = {key: value for key, value in given.items() if key != "results"}
 COMMAND = ["snakemake", "all"]

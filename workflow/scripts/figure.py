@@ -1,23 +1,23 @@
-"""A figure from its data."""
+"""A figure over training, and its data: the curves of every run, and their means over seeds."""
 
 from job import job
 
 number = snakemake.wildcards.number
 with job(f"Figure {number}", snakemake.log[0]):
-    import pandas as pd
-
     from mace_rl.config.results import FigureConfig, MetricsConfig
-    from mace_rl.results.figures import draw_figure, quantity, save_figure
+    from mace_rl.files import write_atomically
+    from mace_rl.results import figures
+    from mace_rl.runs.finished import read_runs
 
-    params = snakemake.params
+    params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    figure = draw_figure(
-        *(pd.read_csv(path) for path in snakemake.input),
-        quantity(number, settings),
-        FigureConfig.model_validate(params.layout),
-        settings.confidence,
-        params.labels,
-        params.colours,
-    )
-    for path in snakemake.output:
-        save_figure(figure, path)
+    layout = FigureConfig.model_validate(params.layout)
+    shown = figures.quantity(number, settings)
+    single_seeds = figures.seed_curves(read_runs(snakemake.input.records, params.runs), shown)
+    curves = figures.mean_curves(single_seeds, shown, settings)
+    write_atomically(output.single_seeds, single_seeds.to_csv(index=False))
+    write_atomically(output.curves, curves.to_csv(index=False))
+    look = figures.Look(layout, settings.confidence, params.labels, params.colours)
+    figure = figures.draw_figure(curves, single_seeds, shown, *look)
+    for path in (output.pdf, output.png):
+        figures.save_figure(figure, path)

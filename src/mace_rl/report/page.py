@@ -23,11 +23,11 @@ from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.report.workflow_graph import BOX_HEIGHT, BOX_WIDTH, Graph
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST
 from mace_rl.results.claims_text import digits_of
-from mace_rl.results.figures import quantity
+from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.metrics_table import read_metrics
 from mace_rl.results.paper import PAPER_METRICS, has_all
-from mace_rl.results.pictures import draw_every_seed, draw_profiles, draw_regret
+from mace_rl.results.pictures import PICTURES
 from mace_rl.results.readings import draw_readings, in_order, ranked, title
 from mace_rl.results.records import RunKey
 from mace_rl.results.tables import digits_by_metric, from_to
@@ -47,7 +47,6 @@ class Tables:
     supplement: pd.DataFrame
     comparisons: pd.DataFrame
     aggregate: pd.DataFrame
-    profiles: pd.DataFrame
     readings: pd.DataFrame
     curves: Mapping[str, pd.DataFrame]  # by the figure's number
     single_seeds: Mapping[str, pd.DataFrame]
@@ -59,7 +58,7 @@ def read_tables(
     found: Mapping[str, Any], runs: Sequence[RunKey], settings: MetricsConfig
 ) -> Tables:
     """The data of these runs, from the files `found` by the names that the rule `page` has."""
-    names = ("table1", "supplement", "comparisons", "aggregate", "profiles", "readings")
+    names = ("table1", "supplement", "comparisons", "aggregate", "readings")
     claims = found.get("claims")
     return Tables(
         metrics=read_metrics(found["metrics"], runs, settings),
@@ -252,15 +251,18 @@ def _pictures(
     labels: Mapping[str, str],
     colours: Mapping[str, str],
 ) -> dict[str, str]:
-    """Those that are wider than a phone, as SVG by name; `regret` only where it is asked for."""
-    drawn = {
-        "readings": draw_readings(tables.readings, labels, colours, settings),
-        "every_seed": draw_every_seed(tables.metrics, labels, colours),
-        "profiles": draw_profiles(tables.profiles, settings.confidence, labels, colours),
+    """Those that are wider than a phone, as SVG by name; those that this study has data for."""
+    look = Look(FigureConfig(columns=3), settings.confidence, labels, colours)
+    made_of = {
+        "every_seed": tables.metrics,
+        "constants": tables.metrics if settings.regret else None,
+        "solved": tables.metrics if settings.solved_return else None,
+        "forest": tables.claims["claims"] if tables.claims else None,
     }
-    if settings.regret:
-        how = settings.regret, FigureConfig(columns=3), settings, labels, colours
-        drawn["regret"] = draw_regret(tables.metrics, *how)
+    drawn = {"readings": draw_readings(tables.readings, labels, colours, settings)}
+    for name, found in made_of.items():
+        if found is not None:
+            drawn[name] = PICTURES[name].draw(PICTURES[name].data(found, settings), look)
     return {name: svg(figure, name, name.replace("_", " ")) for name, figure in drawn.items()}
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
+HIDDEN = 0.01  # of what all means span: lines so near to each other are one to the eye
 _TICKS = {"size": 3, "width": 0.8}  # points
 
 
@@ -42,6 +43,15 @@ class Quantity:
     label: str  # of the y axis
     limits: tuple[float, float] | None = None  # of the y axis; None: what the single seeds span
     zero_is_shown: bool = True  # whether a variant has a curve that is 0 throughout
+
+
+class Look(NamedTuple):
+    """What the configuration says of how pictures look."""
+
+    layout: FigureConfig
+    confidence: float  # of the intervals
+    labels: Mapping[str, str]  # of variants
+    colours: Mapping[str, str]  # of variants
 
 
 def quantity(figure: str, settings: MetricsConfig) -> Quantity:
@@ -127,63 +137,88 @@ def draw_figure(
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
     The mean over seeds is a line, its interval a band (from three seeds on), and the single seeds
-    are faint lines behind. `labels` and `colours` are those of the variants. Where most is learned
-    at the beginning, an inset shows that. Where there is nothing to show, the figure says so.
+    are faint lines behind. Where most is learned at the beginning, an inset shows that. Where there
+    is nothing to show, the figure says so. What follows `shown` is a `Look`.
     """
-    from matplotlib.figure import Figure
-
-    environments, variants = list(curves["env"].unique()), list(curves["variant"].unique())
-    columns = min(layout.columns, max(len(environments), 1))
-    rows = math.ceil(max(len(environments), 1) / columns)
+    environments = list(curves["env"].unique())
     with style():
-        height = rows * PANEL_HEIGHT + LEGEND_HEIGHT
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        names = ("Training episodes", shown.label) if environments else ("", "")
+        figure, panels = grid(max(len(environments), 1), layout.columns, *names)
         if not environments:
             panels[0].text(0.5, 0.5, f"{shown.label} is 0 in every run", ha="center", va="center")
             panels[0].set_axis_off()
             return figure
         uneven = curves["n"].nunique() > 1
-        for place, (environment, axes) in enumerate(zip(environments, panels, strict=False)):
-            for variant in variants:
-                _draw(
-                    axes,
-                    _select(curves, environment, variant),
-                    _select(single_seeds, environment, variant),
-                    shown.name,
-                    colours[variant],
-                    labels[variant],
-                )
-            if shown.limits is None:
-                values = single_seeds.loc[single_seeds["env"] == environment, shown.name]
-                margin = 0.05 * (values.max() - values.min() or 1)
-                axes.set_ylim(values.min() - margin, values.max() + margin)
-            else:
-                axes.set_ylim(*shown.limits)
-            own = curves[curves["env"] == environment]
+        for environment, axes in zip(environments, panels, strict=True):
+            own, runs = (frame[frame["env"] == environment] for frame in (curves, single_seeds))
+            values = runs[shown.name]
+            margin = 0.05 * (values.max() - values.min() or 1)
+            axes.set_ylim(shown.limits or (values.min() - margin, values.max() + margin))
             axes.set_xlim(0, own["episode"].max())
-            axes.locator_params(nbins=5)
+            axes.locator_params(nbins=4)
             axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))
-            if layout.inset and shown.limits is None and _is_early(own, layout.inset):
-                _draw_inset(axes, own, layout.inset, colours)
-            if place % columns == 0:
-                axes.set_ylabel(shown.label)
-            if place + columns >= len(environments):
-                axes.set_xlabel("Training episodes")
-        for axes in panels[len(environments) :]:
-            axes.remove()
-        legend = figure.legend(
-            *panels[0].get_legend_handles_labels(),
-            loc="outside lower center",
-            ncols=min(len(variants), 3),
-            title=_explanation(
-                *(curves["n"].min(), curves["n"].max(), confidence),
-                layout.inset if any(axes.child_axes for axes in panels) else None,
-            ),
-        )
-        for line in legend.get_lines():
-            line.set_linewidth(2)
+            _draw(axes, own, labels, colours)
+            seeds = own.groupby("variant")["n"].max()
+            for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
+                faint: dict[str, Any] = {"color": colours[variant], "linewidth": 0.5}
+                faint |= {"alpha": 0.6 / math.sqrt(seeds[variant]), "zorder": 1}
+                if seeds[variant] > 1:  # else its line is the mean's
+                    axes.plot(run["episode"], run[shown.name], **faint)
+            share = layout.inset
+            if share and shown.limits is None and _is_early(own, share):
+                inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
+                _draw(inset, own[own["episode"] <= share * own["episode"].max()], labels, colours)
+                inset.set_xlim(0, share * own["episode"].max())
+                inset.locator_params(nbins=3)
+                inset.tick_params(labelsize="x-small")
+        fewest, most = curves["n"].min(), curves["n"].max()
+        explained = "One seed."
+        if most > 1:
+            count = f"{most}" if fewest == most else f"{fewest} to {most}"
+            band = f" Band: its {100 * confidence:g} % interval." if most >= BAND_SEEDS else ""
+            explained = f"Line: mean over {count} seeds.{band} Faint lines: single seeds."
+        if layout.inset and any(axes.child_axes for axes in panels):
+            explained += f" Inset: the first {100 * layout.inset:g} %."
+        legend(figure, explained)
     return figure
+
+
+def grid(
+    count: int, columns: int, x: str = "", y: str = "", height: float = PANEL_HEIGHT
+) -> "tuple[Figure, list[Axes]]":
+    """A figure of `count` panels, at most so many side by side, so many inches high each.
+
+    `x` stands below those that have none below them, `y` once on the left.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(WIDTH, rows * height + LEGEND_HEIGHT), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in panels[count:]:
+        axes.remove()
+    for axes in panels[count - columns : count]:
+        axes.set_xlabel(x)
+    figure.supylabel(y, multialignment="center")
+    return figure, panels[:count]
+
+
+def legend(figure: "Figure", explained: str) -> None:
+    """One legend below all panels, with the explanation of dots, lines and bars as its title."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(name, handle)
+    below = figure.legend(
+        list(entries.values()),
+        list(entries),
+        loc="outside lower center",
+        ncols=min(max(len(entries), 1), 4),
+        title=explained,
+    )
+    for line in below.get_lines():
+        line.set_linewidth(2)
 
 
 def save_figure(figure: "Figure", path: str | Path) -> None:
@@ -221,6 +256,7 @@ def style() -> AbstractContextManager[None]:
         seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
         | seaborn.plotting_context("paper", font_scale=0.9)
         | {"legend.frameon": False, "legend.title_fontsize": "small", "axes.linewidth": 0.8}
+        | {"axes.titlesize": "small", "figure.labelsize": "medium"}
         | {f"{axis}tick.major.{part}": size for axis in "xy" for part, size in _TICKS.items()}
         | fonts
     )
@@ -234,52 +270,25 @@ def _is_early(curves: "pd.DataFrame", share: float) -> bool:
     return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
 
 
-def _draw_inset(
-    axes: "Axes", curves: "pd.DataFrame", share: float, colours: Mapping[str, str]
-) -> None:
-    """The first `share` of the episodes: means and bands."""
-    end = share * curves["episode"].max()
-    inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
-    for variant, curve in curves[curves["episode"] <= end].groupby("variant", sort=False):
-        colour = colours[str(variant)]
-        if curve["n"].max() >= BAND_SEEDS:
-            band = curve["episode"], curve["lower"], curve["upper"]
-            inset.fill_between(*band, color=colour, alpha=0.25, linewidth=0)
-        inset.plot(curve["episode"], curve["mean"], color=colour, linewidth=1)
-    inset.set_xlim(0, end)
-    inset.locator_params(nbins=3)
-    inset.tick_params(labelsize="x-small")
-
-
 def _draw(
-    axes: "Axes", curve: "pd.DataFrame", runs: "pd.DataFrame", name: str, colour: str, label: str
+    axes: "Axes", curves: "pd.DataFrame", labels: Mapping[str, str], colours: Mapping[str, str]
 ) -> None:
-    """One variant in one panel: every variant's single seeds are behind every band and line."""
-    episodes, seeds = curve["episode"], curve["n"].max()
-    if seeds > 1:
-        faint: dict[str, Any] = {
-            "color": colour,
-            "linewidth": 0.5,
-            "alpha": 0.6 / np.sqrt(seeds),
-            "zorder": 1,
-        }
-        for _, run in runs.groupby("seed"):
-            axes.plot(run["episode"], run[name], **faint)
-    if seeds >= BAND_SEEDS:
-        band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
-        axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
-    axes.plot(episodes, curve["mean"], color=colour, linewidth=1.3, label=label, zorder=3)
-
-
-def _select(frame: "pd.DataFrame", environment: str, variant: str) -> "pd.DataFrame":
-    return frame[(frame["env"] == environment) & (frame["variant"] == variant)]
-
-
-def _explanation(fewest: int, seeds: int, confidence: float, inset: float | None) -> str:
-    """The legend's title: what lines, bands and insets are."""
-    enlarged = f" Inset: the first {100 * inset:g} %." if inset else ""
-    if seeds == 1:
-        return f"One seed.{enlarged}" if inset else "One seed"
-    count = f"{seeds}" if fewest == seeds else f"{fewest} to {seeds}"
-    band = f" Band: its {100 * confidence:g} % interval." if seeds >= BAND_SEEDS else ""
-    return f"Line: mean over {count} seeds.{band} Faint lines: single seeds.{enlarged}"
+    """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
+    drawn: list[np.ndarray] = []
+    near = HIDDEN * np.ptp(curves["mean"])
+    for name, curve in curves.groupby("variant", sort=False):
+        variant, episodes, mean = str(name), curve["episode"], curve["mean"].to_numpy()
+        colour = colours[variant]
+        if curve["n"].max() >= BAND_SEEDS:
+            band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
+            axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
+        covered = sum(len(mean) == len(one) and abs(mean - one).max() <= near for one in drawn)
+        drawn.append(mean)
+        axes.plot(
+            *(episodes, mean),
+            color=colour,
+            linestyle=(0, (4, 4 * covered)) if covered else "-",
+            linewidth=1.3,
+            label=labels[variant],
+            zorder=3,
+        )

@@ -1,170 +1,251 @@
-"""Pictures of all runs at once: every seed, performance profiles, and the regret of a learned β."""
+"""Pictures of all runs at once, each drawn from data that stands beside it as CSV.
 
-import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+`PICTURES` has them by name: what makes the data, and what draws it.
+"""
+
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import FigureConfig, MetricsConfig, RegretConfig
-from mace_rl.results.aggregate import SCORED, scores
-from mace_rl.results.figures import LEGEND_HEIGHT, PANEL_HEIGHT, WIDTH, style
+from mace_rl.config.results import MetricsConfig
+from mace_rl.results.aggregate import SCORED
+from mace_rl.results.claims import CONFIDENCE, LITERAL, ROBUST, WORTH_MENTIONING
+from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
 from mace_rl.results.metrics import METRICS
-from mace_rl.results.statistics import draws, mean_interval, percentiles
+from mace_rl.results.paper import FIXED, FULL, PPO
+from mace_rl.results.statistics import mean_interval
 
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PROFILE_POINTS = 201  # of τ, from the lowest score of any run to 1
-LABELS = {metric.name: metric.label for metric in METRICS}
+SOLVED = 0.9  # of a seed's last episodes: then it has solved the task
+CONSTANT, LEARNED, OTHER = "constant", "learned", "other"
+METRIC_LABELS = {metric.name: metric.label for metric in METRICS}
+SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β"}  # the paper's variants
+# Of parts, and of the verdicts alike; from seaborn's palette that the colour-blind can tell apart.
+OUTCOMES = {
+    "holds": ("#029e73", "the part holds"),
+    "open": ("#767676", "the part is open"),
+    "fails": ("#d55e00", "the part fails"),
+}
+VERDICTS = {"reproduced": "holds", "inconclusive": "open", "contradicted": "fails"}
+UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
-def profiles(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """Performance profiles: which share of a variant's runs has a score of at least τ.
-
-    table: the frame of metrics.csv; scores as in `aggregate`. Columns: metric, variant, score (τ),
-    share, low, high: the pointwise interval from resampling seeds within environments, NaN if one
-    of these has one seed. (Agarwal et al. 2021, section 4.2.)
-    """
-    every, frames = scores(table, settings), []
-    for (metric, variant), runs in every.groupby(["metric", "variant"], sort=False):
-        lowest = every.loc[every["metric"] == metric, "score"].min()
-        tau = np.linspace(lowest, 1, PROFILE_POINTS)
-        generator = np.random.default_rng(settings.bootstrap_seed)
-        strata = [group["score"].to_numpy() for _, group in runs.groupby("env", sort=False)]
-        reached = np.zeros(len(tau))  # runs, of which those drawn are [repetitions, τ]
-        resampled = np.zeros((settings.bootstrap_repetitions, len(tau)))
-        for values in strata:
-            high_enough = (values[:, None] >= tau).astype(np.float64)  # [seeds, τ]
-            reached += high_enough.sum(axis=0)
-            resampled += draws(len(values), len(resampled), generator) @ high_enough
-        bounds = percentiles(resampled, settings.confidence, min(map(len, strata))) / len(runs)
-        columns = {"score": tau, "share": reached / len(runs), "low": bounds[0], "high": bounds[1]}
-        frames.append(pd.DataFrame({"metric": metric, "variant": variant} | columns))
-    return pd.concat(frames, ignore_index=True)
+def every_seed(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """`SCORED` of every run of metrics.csv. Columns: env, variant, seed, metric, value."""
+    long = runs.melt(["env", "variant", "seed"], list(SCORED), "metric", ignore_index=False)
+    return long.sort_index(kind="stable").reset_index(drop=True)  # run by run
 
 
-def draw_profiles(
-    curves: pd.DataFrame,
-    confidence: float,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
-) -> "Figure":
-    """A panel per metric from `profiles`; a curve that lies higher belongs to better runs."""
-    from matplotlib.figure import Figure
-
-    metrics = list(curves["metric"].unique())
+def draw_every_seed(table: pd.DataFrame, look: Look) -> "Figure":
+    """A dot per run, a dash at the mean of a variant; a row of panels per environment."""
+    jitter = pd.Series(np.random.default_rng(0).uniform(-0.3, 0.3, len(table)), table.index)
+    places = {name: place for place, name in enumerate(table["variant"].unique())}
     with style():
-        figure = Figure(figsize=(WIDTH, PANEL_HEIGHT + LEGEND_HEIGHT), layout="constrained")
-        panels = list(figure.subplots(1, len(metrics), sharey=True, squeeze=False).flat)
-        for metric, axes in zip(metrics, panels, strict=True):
-            for variant, curve in curves[curves["metric"] == metric].groupby("variant", sort=False):
-                name = str(variant)
-                axes.plot(curve["score"], curve["share"], color=colours[name], label=labels[name])
-                band = curve["score"], curve["low"], curve["high"]
-                axes.fill_between(*band, color=colours[name], alpha=0.2, linewidth=0)
-            axes.set_title(LABELS[str(metric)])
-            axes.set_xlabel("Score τ (0: random, 1: the best run)")
-            axes.set_ylim(0, 1.02)
-        panels[0].set_ylabel("Share of runs ≥ τ")
-        _legend(figure, panels[0], f"Band: {100 * confidence:g} % interval.")
+        groups = table.groupby(["env", "metric"], sort=False)
+        figure, panels = grid(groups.ngroups, table["metric"].nunique())
+        for ((environment, metric), shown), axes in zip(groups, panels, strict=True):
+            for variant, runs in shown.groupby("variant", sort=False):
+                name, place, values = str(variant), places[variant], runs["value"]
+                colour = look.colours[name]
+                dots = axes.scatter(place + jitter[runs.index], values, s=6, color=colour)
+                dots.set(alpha=0.7, linewidth=0, label=look.labels[name])
+                axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colour)
+            axes.set_xticks([])
+            axes.set_title(f"{environment}:\n{METRIC_LABELS[str(metric)].lower()}")
+        legend(figure, "Dot: one seed. Line: their mean.")
     return figure
 
 
-def draw_every_seed(
-    table: pd.DataFrame, labels: Mapping[str, str], colours: Mapping[str, str]
-) -> "Figure":
-    """A dot per run of the frame of metrics.csv, a dash at their mean; `SCORED` by environment."""
-    from matplotlib.figure import Figure
+def constants(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The mean return of training of every variant, from the frame of metrics.csv.
 
-    environments, variants = list(table["env"].unique()), list(table["variant"].unique())
-    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(table))
-    with style():
-        height = len(environments) * PANEL_HEIGHT * 0.9 + LEGEND_HEIGHT
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        grid = figure.subplots(len(environments), len(SCORED), squeeze=False)
-        for environment, row in zip(environments, grid, strict=True):
-            for metric, axes in zip(SCORED, row, strict=True):
-                for place, variant in enumerate(variants):
-                    own = (table["env"] == environment) & (table["variant"] == variant)
-                    values = table.loc[own, metric]
-                    if values.empty:
-                        continue
-                    dots = axes.scatter(place + jitter[own], values, s=6, color=colours[variant])
-                    dots.set(alpha=0.7, linewidth=0, label=labels[variant])
-                    axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colours[variant])
-                axes.set_xticks([])
-                axes.set_title(f"{environment}:\n{LABELS[metric].lower()}")
-        _legend(figure, grid[0, 0], "Dot: one seed. Line: their mean.")
-    return figure
-
-
-def draw_regret(
-    table: pd.DataFrame,
-    regret: RegretConfig,
-    layout: FigureConfig,
-    settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
-) -> "Figure":
-    """The mean return of training under every constant β, and that of the variants beside it.
-
-    A panel per environment of the frame of metrics.csv. The constants, in their order, are joined
-    by a line with intervals; the other variants are dots with intervals to the right.
+    Columns: env, variant, role (`CONSTANT` β in their order, `LEARNED`, whose regret is measured,
+    or `OTHER`), mean over seeds, low, high (its interval), seeds.
     """
-    from matplotlib.figure import Figure
+    assert settings.regret is not None  # or nobody asks
+    roles = dict.fromkeys(settings.regret.constants, CONSTANT)
+    roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
+    roles[settings.regret.variant] = LEARNED
+    areas = {key: own["area_under_curve"] for key, own in runs.groupby(["env", "variant"])}
+    rows = []
+    for environment in runs["env"].unique():
+        for variant, role in roles.items():
+            values = areas[environment, variant].to_numpy()
+            low, high = mean_interval(
+                values,
+                settings.confidence,
+                settings.bootstrap_repetitions,
+                np.random.default_rng(settings.bootstrap_seed),
+            )
+            rows.append((environment, variant, role, values.mean(), low, high, len(values)))
+    return pd.DataFrame(rows, columns=["env", "variant", "role", "mean", "low", "high", "seeds"])
 
-    environments = list(table["env"].unique())
-    others = [name for name in table["variant"].unique() if name not in regret.constants]
-    columns = min(layout.columns, len(environments))
-    rows = math.ceil(len(environments) / columns)
+
+def draw_constants(table: pd.DataFrame, look: Look) -> "Figure":
+    """The constants joined by a line, the learned β across them, the others on the right."""
     with style():
-        height = rows * PANEL_HEIGHT * 1.1 + LEGEND_HEIGHT
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for environment, axes in zip(environments, panels, strict=False):
-            runs = table[table["env"] == environment]
-            for place, name in enumerate([*regret.constants, *others]):
-                values = runs.loc[runs["variant"] == name, "area_under_curve"].to_numpy()
-                low, high = mean_interval(
-                    values,
-                    settings.confidence,
-                    settings.bootstrap_repetitions,
-                    np.random.default_rng(settings.bootstrap_seed),
-                )
-                own = name in regret.constants
+        names = "Constant β", "Mean return of training"
+        figure, panels = grid(table["env"].nunique(), look.layout.columns, *names)
+        for (environment, own), axes in zip(table.groupby("env", sort=False), panels, strict=True):
+            fixed = own[own["role"] == CONSTANT]
+            for place, (_, row) in enumerate(own[own["role"] != LEARNED].iterrows()):
+                constant, name = row["role"] == CONSTANT, row["variant"]
                 axes.errorbar(
-                    place + 0.7 * (not own),
-                    values.mean(),
+                    place + 0.5 * (not constant),
+                    row["mean"],
                     # Of equal values a bound and the mean may differ in the last bit.
-                    yerr=np.maximum(0, [[values.mean() - low], [high - values.mean()]]),
+                    np.maximum(0, [[row["mean"] - row["low"]], [row["high"] - row["mean"]]]),
                     fmt="o",
                     markersize=3,
-                    color="dimgray" if own else colours[name],
-                    label=None if own else labels[name],
+                    color="dimgray" if constant else look.colours[name],
+                    label=None if constant else look.labels[name],
                 )
-            means = runs.groupby("variant")["area_under_curve"].mean()[regret.constants]
-            ticks = [labels[name].removeprefix("β = ").partition(" (")[0] for name in means.index]
-            axes.plot(range(len(means)), means, color="dimgray", linewidth=0.8)
-            axes.set_xticks(range(len(means)), ticks, rotation=45)  # "PPO" runs into its neighbour
-            axes.set_title(environment)
-            axes.set_xlabel("constant β")
-        for axes in panels[len(environments) :]:
-            axes.remove()
-        for axes in panels[: len(environments) : columns]:
-            axes.set_ylabel("Mean return of training")
-        _legend(
-            figure,
-            panels[0],
-            f"Dot: mean over seeds. Bar: its {100 * settings.confidence:g} % interval.",
+            axes.plot(range(len(fixed)), fixed["mean"], color="dimgray", linewidth=0.8)
+            for _, row in own[own["role"] == LEARNED].iterrows():
+                colour, label = look.colours[row["variant"]], look.labels[row["variant"]]
+                axes.axhspan(row["low"], row["high"], color=colour, alpha=0.2, linewidth=0)
+                axes.axhline(row["mean"], color=colour, linewidth=1.3, label=label, zorder=1)
+            ticks = [
+                look.labels[name].removeprefix("β = ").partition(" (")[0]
+                for name in fixed["variant"]
+            ]
+            axes.set_xticks(range(len(fixed)), ticks, rotation=90)
+            axes.set_title(str(environment))
+        interval = f"{100 * look.confidence:g} % interval"
+        legend(
+            figure, f"Dot or line: mean over seeds; bar or band: its {interval}. Grey: constants."
         )
     return figure
 
 
-def _legend(figure: "Figure", panel: "Axes", title: str | None = None) -> None:
-    """One legend for all panels, below them."""
-    handles, names = panel.get_legend_handles_labels()
-    columns = min(len(names), 4)
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, title=title)
+def solved(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame.
+
+    Columns: env, variant, solved, seeds.
+    """
+    counted = runs.assign(solved=runs["solved"] >= SOLVED).groupby(["env", "variant"], sort=False)
+    return counted["solved"].agg(solved="sum", seeds="size").reset_index()
+
+
+def draw_solved(table: pd.DataFrame, look: Look) -> "Figure":
+    """A cell per variant and environment: the darker, the more seeds solve it; in it how many."""
+    import seaborn
+
+    table = table.assign(
+        share=table["solved"] / table["seeds"],
+        text=table["solved"].astype(str) + "/" + table["seeds"].astype(str),
+    )
+    share, text = (
+        table.pivot(index="variant", columns="env", values=name).loc[
+            table["variant"].unique(), table["env"].unique()
+        ]
+        for name in ("share", "text")
+    )
+    with style():
+        figure, (axes,) = grid(1, 1, height=0.24 * len(share) + 2 * LEGEND_HEIGHT)
+        how: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "Blues", "linewidths": 1, "fmt": ""}
+        seaborn.heatmap(share, ax=axes, annot=text, annot_kws={"size": "small"}, cbar=False, **how)
+        axes.set(xlabel="", ylabel="")
+        axes.set_yticks(axes.get_yticks(), [look.labels[name] for name in share.index])
+        axes.set_xticks(axes.get_xticks(), share.columns, rotation=25, ha="left")
+        axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False, left=False)
+        explained = f"solve at least {100 * SOLVED:g} % of the last episodes"
+        legend(figure, f"How many seeds, of how many, {explained}. Darker: a larger share.")
+    return figure
+
+
+def forest(ledger: Sequence[Mapping[str, Any]], settings: MetricsConfig) -> pd.DataFrame:
+    """Every part of every claim of claims.json, measured in what would be worth mentioning.
+
+    Columns: measured (`LITERAL` or `ROBUST`), claim, statement, verdict (of the claim), part (what
+    tells it from the claim's others), metric, seeds, difference, low, high, paper (the same in the
+    paper's Table 1; NaN where that has none), outcome (of the part). More is in the claim's favour.
+    """
+    rows = []
+    for how in (LITERAL, ROBUST):
+        for claim in ledger:
+            parts = claim[how]["parts"]
+            common = (how, claim["claim"], claim["statement"], claim[how]["verdict"])
+            for part in parts:
+                values = [part[key] for key in ("difference", "low", "high", "in_paper")]
+                unit = part["worth_mentioning"]
+                scaled = [np.nan if value is None else value / unit for value in values]
+                measured = (_what(part, parts), part["metric"], part["seeds"])
+                rows.append((*common, *measured, *scaled, part["outcome"]))
+    columns = ["measured", "claim", "statement", "verdict", "part", "metric", "seeds"]
+    columns += ["difference", "low", "high", "paper", "outcome"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _what(part: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> str:
+    """What tells a part from the others of its claim."""
+    differ = {key for key in ("environments", "metric") if any(p[key] != part[key] for p in parts)}
+    words = [name.partition("-")[0] for name in part["environments"] if "environments" in differ]
+    words += [METRIC_LABELS[part["metric"]].lower()] if "metric" in differ else []
+    words += [f"over {SHORT[part['baseline']]}"] if part["baseline"] else []
+    return ", ".join(words)
+
+
+def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
+    """A line per part, a panel per way of measuring; a claim's verdict stands at its right."""
+    small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
+    hollow: dict[str, Any] = {"color": "0.3", "markerfacecolor": "white", "markersize": 4}
+    hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
+    reach = 1.1 * np.nanmax(table[["low", "high", "difference", "paper"]].abs().to_numpy())
+    table = table.assign(place=table.groupby("measured").cumcount())
+    count, ways = table["place"].max() + 1, table["measured"].unique()
+    with style():
+        height = 0.2 * count + LEGEND_HEIGHT
+        figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
+        for how, axes in zip(ways, panels, strict=True):
+            own = table[table["measured"] == how]
+            for outcome, (colour, label) in OUTCOMES.items():
+                parts = own[own["outcome"] == outcome]
+                axes.hlines(
+                    parts["place"], parts["low"], parts["high"], color=colour, linewidth=1.2
+                )
+                dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
+                axes.plot(parts["difference"], parts["place"], "o", **dots)
+            axes.plot(own["paper"], own["place"], "d", **hollow)
+            axes.axvline(0, color="0.3", linewidth=0.8, zorder=1)
+            axes.axvline(1, color="0.3", linewidth=0.8, linestyle="--", zorder=1)
+            axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
+            axes.set_xlabel(f"Difference in the claim's favour\n(1: {UNIT})")
+            for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
+                first, last, verdict = claim["place"].min(), claim["place"].max(), claim["verdict"]
+                colour, _ = OUTCOMES[VERDICTS[verdict.iloc[0]]]
+                axes.text(reach, first, verdict.iloc[0], color=colour, ha="right", **small)
+                for panel in (names, axes):
+                    grey = "0.94" if shade % 2 else "white"
+                    panel.axhspan(first - 0.5, last + 0.5, color=grey, zorder=0)
+                if how == ways[-1]:
+                    said = " ".join(claim[["claim", "statement"]].iloc[0]).replace(" β", "\u00a0β")
+                    names.text(0, claim["place"].mean(), textwrap.fill(said, 24), **small)
+                    for place, part in zip(claim["place"], claim["part"], strict=True):
+                        names.text(1, place, part, ha="right", **small)
+        names.set_axis_off()
+        for panel in (names, *panels):
+            panel.set_ylim(count - 0.5, -0.5)
+        interval = f"{100 * CONFIDENCE:g} % interval"
+        legend(figure, f"Dot: mean over seeds. Bar: its {interval}. Dashed: {UNIT}, the margin.")
+    return figure
+
+
+class Picture(NamedTuple):
+    """What makes the data of a picture, of metrics.csv's frame or the claims, and what draws it."""
+
+    data: Callable[[Any, MetricsConfig], pd.DataFrame]
+    draw: Callable[[pd.DataFrame, Look], "Figure"]
+
+
+PICTURES = {
+    "every_seed": Picture(every_seed, draw_every_seed),
+    "constants": Picture(constants, draw_constants),
+    "solved": Picture(solved, draw_solved),
+    "forest": Picture(forest, draw_forest),
+}
