@@ -46,11 +46,7 @@ rule all:
         f"{RESULTS}/figure2.png",
         f"{RESULTS}/figure2.csv",
         *[f"{RESULTS}/{name}.csv" for name in REGRET],
-        *[
-            f"{RESULTS}/{picture}.{kind}"
-            for picture in (PICTURES + ["forest"] if CLAIMS else PICTURES)
-            for kind in ("csv", "pdf", "png")
-        ],
+        *[f"{RESULTS}/{name}.{kind}" for name in PICTURES for kind in ("csv", "pdf", "png")],
         f"{RESULTS}/readings.csv",
         f"{RESULTS}/readings.md",
         f"{RESULTS}/readings.pdf",

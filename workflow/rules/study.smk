@@ -53,6 +53,7 @@ REGRET = ["regret"] if study.metrics.regret else []
 PICTURES = ["every_seed"]  # and what the configuration has the numbers for
 PICTURES += ["constants"] if MEASURED.regret else []
 PICTURES += ["solved"] if MEASURED.solved_return else []
+PICTURES += ["forest"] if CLAIMS else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = {key: value for key, value in given.items() if key != "results"}
 COMMAND = ["snakemake", "all"]

@@ -32,6 +32,7 @@ OUTCOMES = {
     "fails": ("#d55e00", "the part fails"),
 }
 VERDICTS = {"reproduced": "holds", "inconclusive": "open", "contradicted": "fails"}
+INK = "#262626"  # as seaborn draws axes
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
@@ -148,8 +149,10 @@ def draw_solved(table: pd.DataFrame, look: Look) -> "Figure":
     )
     with style():
         figure, (axes,) = grid(1, 1, height=0.24 * len(share) + 2 * LEGEND_HEIGHT)
-        how: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "Blues", "linewidths": 1, "fmt": ""}
-        seaborn.heatmap(share, ax=axes, annot=text, annot_kws={"size": "small"}, cbar=False, **how)
+        blues = seaborn.light_palette("#4a90c8", as_cmap=True)  # on which one colour can be read
+        how: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": blues, "linewidths": 1, "cbar": False}
+        cells = {"size": "small", "color": "#111111"}
+        seaborn.heatmap(share, ax=axes, annot=text, fmt="", annot_kws=cells, **how)
         axes.set(xlabel="", ylabel="")
         axes.set_yticks(axes.get_yticks(), [look.labels[name] for name in share.index])
         axes.set_xticks(axes.get_xticks(), share.columns, rotation=25, ha="left")
@@ -194,9 +197,10 @@ def _what(part: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> str:
 def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
     """A line per part, a panel per way of measuring; a claim's verdict stands at its right."""
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
-    hollow: dict[str, Any] = {"color": "0.3", "markerfacecolor": "white", "markersize": 4}
+    hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
     hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
-    reach = 1.1 * np.nanmax(table[["low", "high", "difference", "paper"]].abs().to_numpy())
+    ends = table[["low", "high", "difference", "paper"]].abs()
+    reach = 1.1 * max(1, np.nanmax(ends.to_numpy()))
     table = table.assign(place=table.groupby("measured").cumcount())
     count, ways = table["place"].max() + 1, table["measured"].unique()
     with style():
@@ -212,8 +216,8 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
                 dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(parts["difference"], parts["place"], "o", **dots)
             axes.plot(own["paper"], own["place"], "d", **hollow)
-            axes.axvline(0, color="0.3", linewidth=0.8, zorder=1)
-            axes.axvline(1, color="0.3", linewidth=0.8, linestyle="--", zorder=1)
+            axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
+            axes.axvline(1, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
             axes.set_xlabel(f"Difference in the claim's favour\n(1: {UNIT})")
             for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
@@ -221,7 +225,7 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
                 colour, _ = OUTCOMES[VERDICTS[verdict.iloc[0]]]
                 axes.text(reach, first, verdict.iloc[0], color=colour, ha="right", **small)
                 for panel in (names, axes):
-                    grey = "0.94" if shade % 2 else "white"
+                    grey = "0.9" if shade % 2 else "white"
                     panel.axhspan(first - 0.5, last + 0.5, color=grey, zorder=0)
                 if how == ways[-1]:
                     said = " ".join(claim[["claim", "statement"]].iloc[0]).replace(" β", "\u00a0β")
