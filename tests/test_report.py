@@ -221,6 +221,7 @@ def test_costs_workflow_and_configuration(page: Page, made: Path) -> None:
     assert len(steps) == 18 and " 18 " in page.words("costs")
     files_of_rules = ROOT.glob("workflow/rules/*.smk")
     rules = re.findall(r"^rule (\w+):", "".join(p.read_text() for p in files_of_rules), re.M)
+    rules.remove("picture")  # the page draws its own
     nodes = page.all("workflow", "rect")
     assert len(nodes) == len(rules) and all(rule in page.words("workflow") for rule in rules)
     assert "18 runs" in page.words("workflow") and "torch 2." in page.words("workflow")
@@ -267,7 +268,7 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, tmp_path: Pa
         assert f"runs/{variant}" in page.words("agents")
     assert "Not shown, because agent.pt is not there" in page.words("agents")
     assert not page.all("agents", "img")
-    assert "regret" in [one.get("aria-label") for one in page.all("statistics", "svg")]
+    assert "constants" in [one.get("aria-label") for one in page.all("statistics", "svg")]
     assert "loses against the best constant" in page.words("statistics")
     assert "β is 0 throughout" in page.words("beta")
     assert "on the command line over them seeds=0, 1" in page.words("configuration")
