@@ -27,7 +27,7 @@ PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxp
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick tables numbers report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick tables report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -43,9 +43,6 @@ test-quick: setup ## the tests that take seconds, for the edit loop
 
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
-
-numbers: setup ## write what the tables of reference/ say into README and docs
-	@$(IN_VENV) tools.printed_numbers
 
 report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)

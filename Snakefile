@@ -19,10 +19,9 @@ localrules:
     all,
     metrics,
     claims,
-    table1,
+    tables,
     table2,
-    comparisons,
-    aggregate,
+    tables_page,
     figure,
     picture,
     readings,
@@ -32,6 +31,8 @@ localrules:
 rule all:
     input:
         f"{RESULTS}/metrics.csv",
+        f"{RESULTS}/betas.csv",
+        f"{RESULTS}/tables.md",
         f"{RESULTS}/table1.tex",
         f"{RESULTS}/table1.csv",
         f"{RESULTS}/supplement.tex",

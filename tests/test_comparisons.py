@@ -1,4 +1,4 @@
-"""Comparisons and regret from a small frame, against scipy, enumeration and loops."""
+"""Comparisons, regret and scores from small frames, against scipy, enumeration and loops."""
 
 from functools import partial
 from itertools import product
@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import table_for_tables
+from invented import SEEDS, table_for_scores, table_for_tables
 
 from mace_rl.config.results import RegretConfig
-from mace_rl.config.study import read_study
+from mace_rl.config.study import Study, read_study
+from mace_rl.results import aggregate as a
 from mace_rl.results.comparisons import comparisons, regret
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.statistics import logrank, probability_of_improvement
@@ -29,12 +30,19 @@ def generator():
     return np.random.default_rng(SETTINGS.bootstrap_seed)
 
 
-def test_pairs_of_which_a_variant_is_missing_are_left_out():
+def expanded(drawn, seeds):
+    """The bounds of an expanded percentile interval."""
+    z = np.sqrt(seeds / (seeds - 1)) * scipy.stats.t.ppf(0.975, seeds - 1)
+    return np.quantile(drawn, scipy.stats.norm.cdf([-z, z]))
+
+
+def test_which_pairs_are_compared_where():
     frame = comparisons(metrics(variants=["ppo", "mace_full"]), SETTINGS)
     assert set(zip(frame["variant"], frame["baseline"], strict=True)) == {("mace_full", "ppo")}
     frame = comparisons(metrics(variants=["ppo"]), SETTINGS)
-    assert frame.empty
-    assert "p_holm" in frame
+    assert frame.empty and "p_holm" in frame
+    alone = comparisons(metrics(["CartPole-v1"]), SETTINGS)  # not repeated as all environments
+    assert set(alone["env"]) == {"CartPole-v1"}
 
 
 def test_comparisons_against_scipy_and_enumeration():
@@ -57,12 +65,12 @@ def test_comparisons_against_scipy_and_enumeration():
         assert (row.low, row.high) == pytest.approx(paired.confidence_interval(0.95))
         if UNITS[row.metric] == "episodes":
             assert (row.test, row.p_value) == ("log-rank", logrank(x, y, HOW[1], generator()))
-            better = np.less.outer(x, y)
+            x, y = -x, -y
         else:
             flips = np.mean(abs(signs @ (x - y)) >= abs(sum(x - y)))
             assert (row.test, row.p_value) == ("sign-flip", flips)
-            better = np.greater.outer(x, y)
-        assert row.probability == pytest.approx(np.mean(better + np.equal.outer(x, y) / 2))
+        u = scipy.stats.mannwhitneyu(x, y).statistic
+        assert row.probability == pytest.approx(u / 81)
         assert row.probability_low <= row.probability <= row.probability_high
         assert (row.seeds, row.censored) == (9, 0)
     # Holm: the k-th smallest of m times m - k + 1, and never less than one before.
@@ -73,8 +81,6 @@ def test_comparisons_against_scipy_and_enumeration():
     # Over the environments together: the mean probability.
     untested = ["difference", "low", "high", "p_value", "p_holm"]
     assert together[untested].isna().all(axis=None)
-    alone = result.groupby(["metric", "variant", "baseline"], sort=False)["probability"].mean()
-    assert together["probability"].tolist() == pytest.approx(alone.tolist())
     row = together.iloc[0]  # final_return of mace_fixed and ppo
     runs = [frame[frame["env"] == name].set_index("variant") for name in frame["env"].unique()]
     pairs = [
@@ -83,10 +89,6 @@ def test_comparisons_against_scipy_and_enumeration():
     ]
     expected = probability_of_improvement(pairs, *HOW, generator())
     assert tuple(row[["probability", "probability_low", "probability_high"]]) == expected
-
-
-def test_one_environment_is_not_repeated_as_all():
-    assert set(comparisons(metrics(["CartPole-v1"]), SETTINGS)["env"]) == {"CartPole-v1"}
 
 
 def kaplan_meier_mean(values, flags, end):
@@ -137,6 +139,8 @@ AREAS = {  # by environment: of the meta network and of three constants
     "CartPole-v1": {"mace_full": 300.0, "ppo": 200.0, "mace_fixed": 350.0, "low": 340.0},
     "Acrobot-v1": {"mace_full": -120.0, "ppo": -110.0, "mace_fixed": -400.0, "low": -300.0},
 }
+CHOSEN = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])
+REGRET = SETTINGS.model_copy(update={"regret": CHOSEN})
 
 
 def regret_of(seeds=8, noise=0.0, draw=1, **areas):
@@ -145,21 +149,25 @@ def regret_of(seeds=8, noise=0.0, draw=1, **areas):
     draws = np.random.default_rng(draw)
     means = [areas.get(row.variant, AREAS[row.env][row.variant]) for row in frame.itertuples()]
     frame["area_under_curve"] = means + noise * draws.normal(size=len(frame))
-    chosen = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])
-    settings = SETTINGS.model_copy(update={"regret": chosen})
-    return regret(frame, settings).set_index("env"), frame
+    return regret(frame, REGRET).set_index("env"), frame
 
 
 def test_regret_by_hand():
     result, _ = regret_of()
     by_hand = {"CartPole-v1": 50 / (350 - 22.1), "Acrobot-v1": 10 / (-110 + 499.1)}
+    by_hand["all"] = np.mean(list(by_hand.values()))
     for name, value in by_hand.items():
         assert result.loc[name, ["regret", "low", "high"]].tolist() == pytest.approx([value] * 3)
     assert result["best_constant"].tolist() == ["mace_fixed", "ppo", ""]
-    assert result["best_area"].tolist()[:2] == [350, -110]
-    assert result["variant_area"].tolist()[:2] == [300, -120]
-    assert result.loc["all", "regret"] == pytest.approx(np.mean(list(by_hand.values())))
+    assert result[["best_area", "variant_area"]].to_numpy()[:2].tolist() == [
+        *([350, 300], [-110, -120])
+    ]
     assert (result["seeds"] == 8).all()
+    constants = dict.fromkeys(("ppo", "mace_fixed", "low"), -600.0)  # none beats random
+    assert regret_of(**constants)[0][["regret", "low", "high"]].isna().all(axis=None)
+    one_seed, _ = regret_of(seeds=1)
+    assert one_seed["regret"].notna().all()
+    assert one_seed[["low", "high"]].isna().all(axis=None)
 
 
 def test_the_interval_of_regret_chooses_the_best_constant_anew():
@@ -174,50 +182,57 @@ def test_the_interval_of_regret_chooses_the_best_constant_anew():
             regrets[name].append((best - means["mace_full"]) / (best - random))
     regrets["all"] = np.mean(list(regrets.values()), axis=0)
     for name, drawn in regrets.items():
-        z = np.sqrt(8 / 7) * scipy.stats.t.ppf(0.975, 7)
-        expected = np.quantile(drawn, scipy.stats.norm.cdf([-z, z]))
-        found = result.loc[name, ["low", "high"]].astype(float)
+        found, expected = result.loc[name, ["low", "high"]].astype(float), expanded(drawn, 8)
         np.testing.assert_allclose(found, expected, atol=0.12 * np.ptp(expected))
-
-
-def test_the_regret_of_equals_errs_upward():
-    """The best of three equal constants is lucky: a variant that is just as good has a regret."""
+    # The best of three equal constants is lucky: a variant that is just as good has a regret.
     equal = dict.fromkeys(AREAS["CartPole-v1"], 100.0)
-    regrets = [
-        regret_of(noise=20, draw=draw, **equal)[0].loc["all", "regret"] for draw in range(20)
-    ]
-    assert np.mean(regrets) > 2 * scipy.stats.sem(regrets)
+    lucky = [regret_of(noise=20, draw=draw, **equal)[0].loc["all", "regret"] for draw in range(20)]
+    assert np.mean(lucky) > 2 * scipy.stats.sem(lucky)
 
 
-def test_environments_may_have_different_seeds():
-    _, frame = regret_of(noise=30)
+def test_environments_are_measured_apart_and_may_have_different_seeds():
+    all_of_it, frame = regret_of(noise=30)
     fewer = frame[(frame["env"] != "Acrobot-v1") | (frame["seed"] < 5)]
-    settings = SETTINGS.model_copy(
-        update={"regret": RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])}
-    )
-    found = regret(fewer, settings).set_index("env")
+    found = regret(fewer, REGRET).set_index("env")
     assert found["seeds"].to_dict() == {"CartPole-v1": 8, "Acrobot-v1": 5, "all": 5}
     both = found.loc[["CartPole-v1", "Acrobot-v1"], "regret"].mean()
     assert found.loc["all", "regret"] == pytest.approx(both)
+    alone = regret(frame[frame["env"] == "Acrobot-v1"], REGRET).set_index("env")
+    pd.testing.assert_frame_equal(all_of_it.loc[["Acrobot-v1"]], alone, check_exact=True)
 
 
-def test_regret_without_a_constant_that_beats_random_is_nan():
-    constants = dict.fromkeys(("ppo", "mace_fixed", "low"), -600.0)
-    result, _ = regret_of(**constants)
-    assert result[["regret", "low", "high"]].isna().all(axis=None)
-    one_seed, _ = regret_of(seeds=1)
-    assert one_seed["regret"].notna().all()
-    assert one_seed[["low", "high"]].isna().all(axis=None)
+def test_aggregate_against_a_loop(study: Study):
+    """Scores between random (0) and the best run (1), resampled within environments."""
+    frame = table_for_scores(SEEDS)
+    score = a.scores(frame, study.metrics)
+    for (env, metric), own in score.groupby(["env", "metric"]):
+        returns = frame.loc[frame["env"] == env, metric]
+        random = study.metrics.random_return_in(env)
+        expected = (returns - random) / (returns.max() - random)
+        assert own["score"].tolist() == pytest.approx(expected.tolist())
+    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])
+    runs = score[(score["metric"] == "final_return") & (score["variant"] == "ppo")]
+    row = found.loc["final_return", "ppo"]
+    assert (row["runs"], row["mean"]) == (22, pytest.approx(runs["score"].mean()))
+    assert row["iqm"] == pytest.approx(runs["score"].sort_values().iloc[5:17].mean())
+    draws, resampled = np.random.default_rng(9), []
+    strata = [group["score"].to_numpy() for _, group in runs.groupby("env")]
+    for _ in range(4000):
+        drawn = np.concatenate([draws.choice(values, len(values)) for values in strata])
+        resampled.append(np.mean(np.sort(drawn)[5:17]))
+    expected = expanded(resampled, 10)
+    bounds = [row["iqm_low"], row["iqm_high"]]
+    np.testing.assert_allclose(bounds, expected, atol=0.1 * np.ptp(expected))
 
 
-def test_a_cell_does_not_depend_on_the_other_environments():
-    result, frame = regret_of(noise=30)
-    alone = frame[frame["env"] == "Acrobot-v1"]
-    settings = SETTINGS.model_copy(
-        update={"regret": RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])}
-    )
-    (_, expected), *rest = regret(alone, settings).iterrows()
-    assert not rest  # one environment is not repeated as all of them
-    pd.testing.assert_series_equal(
-        result.loc["Acrobot-v1"], expected.drop("env"), check_names=False, check_exact=True
-    )
+def test_nobody_better_than_random_counts_as_zero_and_one_seed_has_no_interval(study: Study):
+    frame = table_for_scores(SEEDS)
+    hopper = frame["env"] == "HopperBulletEnv-v0"
+    frame.loc[hopper, list(a.SCORED)] = -3.0
+    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])["mean"]
+    other = a.scores(frame[~hopper], study.metrics)
+    for key, runs in other.groupby(["metric", "variant"]):
+        assert found[key] == pytest.approx(runs["score"].sum() / 22)
+    one = a.aggregate(table_for_scores({"CartPole-v1": 1}), study.metrics)
+    assert one["mean"].notna().all()
+    assert one[["mean_low", "mean_high", "iqm_low", "iqm_high"]].isna().all(axis=None)

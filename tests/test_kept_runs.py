@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from mace_rl import files
 from mace_rl.runs.provenance import KEYS
-from tools import kept_runs, tables
+from tools import kept_runs
 
 
 def make_run(folder: Path, text: str) -> None:
@@ -56,9 +55,11 @@ def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> N
     assert content(tmp_path / "kept") == content(tmp_path / "kept whole")
 
 
-def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
-    run = tmp_path / "results/runs/A-v1/ppo/seed0"
+def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_path: Path) -> None:
+    run, kept = tmp_path / "results/runs/A-v1/ppo/seed0", tmp_path / "kept"
     make_run(run, "1\n")
+    kept_runs.pack(tmp_path / "results", kept)
+    before = content(kept)
     (run / files.EPISODES).write_text("2\n")
     with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
@@ -66,13 +67,6 @@ def test_records_that_are_not_the_runs_are_refused(tmp_path: Path) -> None:
     (run / files.AGENT).write_text("another")
     with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-
-
-def test_another_run_of_a_seed_that_is_kept_is_refused(tmp_path: Path) -> None:
-    run, kept = tmp_path / "results/runs/A-v1/ppo/seed0", tmp_path / "kept"
-    make_run(run, "1\n")
-    kept_runs.pack(tmp_path / "results", kept)
-    before = content(kept)
     shutil.rmtree(run)
     make_run(run, "2\n")
     with pytest.raises(ValueError, match=r"ppo\.tar\.xz has another run of this seed"):
@@ -96,10 +90,3 @@ def test_where_there_are_no_runs_nothing_is_done(
         kept_runs.main()
     assert ended.value.code == f"kept_runs: {origin}: no {wanted} in it"
     assert content(tmp_path) == before
-
-
-def test_the_example_packs_where_the_tables_are_made_from() -> None:
-    packed, unpacked = re.findall(
-        r"(?m)^    \S+ -m tools\.kept_runs .* (\S+) (\S+)$", kept_runs.__doc__
-    )
-    assert Path(packed[1]) == Path(unpacked[0]) == tables.KEPT

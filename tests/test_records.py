@@ -1,13 +1,11 @@
 """The contract of episodes.csv: it comes back to the bit, and what is damaged is refused."""
 
-import csv
 import hashlib
 import os
 
 import numpy as np
 import pytest
 
-from mace_rl.files import write_atomically
 from mace_rl.results.records import RecordError, read_episodes, read_table, write_episodes
 
 HEADER = "episode,env_steps,length,extrinsic_return,intrinsic_return,beta,terminated"
@@ -45,23 +43,14 @@ def test_doubles_and_integers_come_back_to_the_bit(tmp_path):
         assert frame[name].to_numpy().tobytes() == values.tobytes()
 
 
-def test_the_file_is_plain_csv_with_shortest_doubles(tmp_path):
-    path = tmp_path / "episodes.csv"
-    one = {name: values[:1] for name, values in columns().items()}
-    write_episodes(path, one | {"extrinsic_return": np.array([0.1]), "beta": np.array([1.0])})
-    with path.open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    assert row["extrinsic_return"] == "0.1"
-    assert row["beta"] == "1.0"
-    assert row["episode"] == "1"
-
-
 def test_a_valid_file_written_by_hand_is_read(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text(text())
     frame = read_episodes(path, 3)
     assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
     assert frame["terminated"].tolist() == [1, 0, 1]
+    write_episodes(tmp_path / "again.csv", {name: frame[name].to_numpy() for name in frame})
+    assert (tmp_path / "again.csv").read_text() == text()
 
 
 DAMAGE = {  # what the file holds, and what the message must name
@@ -77,9 +66,7 @@ DAMAGE = {  # what the file holds, and what the message must name
     "a short row": (text([ROWS[0], "2,30,20,-19.0,0.5,0.3996", ROWS[2]]), "line 3", "6 cells"),
     "a long row": (text([ROWS[0] + ",1", *ROWS[1:]]), "line 2", "8 cells"),
     "a blank line": (text([*ROWS, ""]), "line 5", "1 cells"),
-    "a blank line within": (text([ROWS[0], "", *ROWS[1:]]), "line 3", "1 cells"),
     "a gap": (text([ROWS[0], "3,30,20,-19.0,0.0,0.4,0"]), "line 3", "episode is 3"),
-    "a repeat": (text([ROWS[0], *ROWS]), "line 3", "episode is 1"),
     "from zero": (text(["0,10,10,9.5,0.25,0.4,1"]), "line 2", "episode is 0"),
     "swapped rows": (text([ROWS[1], ROWS[0], ROWS[2]]), "line 2", "episode is 2"),
     "fewer episodes": (text(ROWS[:2]), "line 3", "2 episodes"),
@@ -89,10 +76,8 @@ DAMAGE = {  # what the file holds, and what the message must name
     "NaN": (text([ROWS[0].replace("9.5", "nan")]), "line 2", "extrinsic_return is 'nan'"),
     "Inf": (text([ROWS[0].replace("0.25", "inf")]), "line 2", "intrinsic_return is 'inf'"),
     "overflow": (text([ROWS[0].replace("9.5", "1e999")]), "line 2", "'1e999'"),
-    "underscore": (text([ROWS[0].replace("9.5", "9_5")]), "line 2", "'9_5'"),
     "a digit too many": (text([ROWS[0].replace("9.5", "9.50")]), "line 2", "'9.50'"),
     "a space": (text([ROWS[0].replace("9.5", " 9.5")]), "line 2", "' 9.5'"),
-    "a float for an integer": (text(["1.0" + ROWS[0][1:]]), "line 2", "episode is '1.0'"),
     "an enormous integer": (text(["1," + "9" * 30 + ",10,9.5,0.25,0.4,1"]), "line 2", "env_steps"),
     "env_steps": (text([ROWS[0], ROWS[1].replace("30", "31")]), "line 3", "env_steps is 31"),
     "length": (text(["1,0,0,9.5,0.25,0.4,1"]), "line 2", "length is 0"),
@@ -101,7 +86,6 @@ DAMAGE = {  # what the file holds, and what the message must name
     "beta above": (text([ROWS[0].replace("0.4", "1.5")]), "line 2", "beta is 1.5"),
     "beta below": (text([ROWS[0].replace("0.4", "-0.1")]), "line 2", "beta is -0.1"),
     "terminated": (text([ROWS[0][:-1] + "2"]), "line 2", "terminated is 2"),
-    "terminated as a word": (text([ROWS[0][:-1] + "True"]), "line 2", "terminated is 'True'"),
     "windows newlines": (text().replace("\n", "\r\n"), "line 1", "terminated"),
     "semicolons": (text().replace(",", ";"), "line 1", "episode"),
     "a NUL": (text([ROWS[0].replace("9.5", "9\0")]), "line 2", "extrinsic_return"),
@@ -145,12 +129,6 @@ def test_every_cut_is_refused(tmp_path):
             read_episodes(tmp_path / "cut.csv", 3)
 
 
-def test_the_first_bad_line_is_named(tmp_path):
-    (tmp_path / "e.csv").write_text(text(["1,10,10,9.5,0.25,9.0,1", "7,30,20,-19.0,0.5,0.3,0"]))
-    with pytest.raises(RecordError, match="line 2: beta"):
-        read_episodes(tmp_path / "e.csv", 2)
-
-
 def test_missing_files_folders_and_other_encodings_are_refused(tmp_path):
     with pytest.raises(RecordError, match=r"none\.csv: cannot be read: No such file"):
         read_episodes(tmp_path / "none.csv", 3)
@@ -191,11 +169,6 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     write_episodes(path, columns())
     assert len(read_episodes(path, 3)) == 3
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_write_atomically_keeps_the_text_as_it_is(tmp_path):
-    write_atomically(tmp_path / "claims.md", "β\n")
-    assert (tmp_path / "claims.md").read_bytes() == "β\n".encode()
 
 
 def test_a_table_of_text_and_numbers(tmp_path):

@@ -20,7 +20,7 @@ from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_fig
 from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
-from mace_rl.results.tables import table1
+from mace_rl.results.summary import table1
 from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]

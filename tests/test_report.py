@@ -1,4 +1,4 @@
-"""The report of a tiny study, as a browser without network has it."""
+"""The report and the page of tables of a tiny study, as a browser without network has it."""
 
 import base64
 import io
@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -20,26 +19,21 @@ from PIL import Image
 from mace_rl import files
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import read_study
-from mace_rl.report.animations import animations
-from mace_rl.report.page import Making, number, read_tables
+from mace_rl.report.animations import Animations, animations
+from mace_rl.report.page import Making, _costs, _too_few, duration, read_data, short
 from mace_rl.report.page import page as build
-from mace_rl.report.workflow_graph import graph
 from mace_rl.results.claims import LITERAL, ROBUST
 from mace_rl.results.comparisons import regret
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
+from mace_rl.results.renderings import number
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
 from tools.tables import RULES
 
 ROOT = Path(__file__).parents[1]
-CONFIG = ROOT / "config.yaml"
-
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
-needs_browser = pytest.mark.skipif(
-    BROWSER is None and "CI" not in os.environ, reason="needs chromium (Debian: apt install)"
-)
 SECTIONS = ["verdicts", "learning", "table1", "agents", "beta"]
 SECTIONS += ["ranking", "statistics", "ledger", "costs", "workflow", "configuration"]
 MOST_BYTES = 25_000_000
@@ -65,7 +59,7 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         self.in_style = False
-        if tag in ("td", "th", "p", "h2", "h3", "text", "summary"):
+        if tag in ("td", "th", "p", "h2", "h3", "text", "summary", "span"):
             self.handle_data(" ")
 
     def handle_data(self, data: str) -> None:
@@ -83,20 +77,11 @@ class Page(HTMLParser):
         return [found for where, name, found in self.elements if (where, name) == (section, tag)]
 
 
-def opened(path: Path, tmp_path: Path) -> Page:
-    """The page as the browser understands it, which has no network."""
-    command = [BROWSER or "chromium", "--headless", "--no-sandbox", "--disable-gpu"]
-    command += ["--proxy-server=127.0.0.1:9", f"--user-data-dir={tmp_path}/profile"]
-    command += ["--dump-dom", path.as_uri()]
-    dumped = subprocess.run(command, capture_output=True, timeout=120, check=True)
-    return Page(dumped.stdout.decode())
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a study of everything that the paper has, in miniature, and its report."""
     folder = tmp_path_factory.mktemp("report")
-    shutil.copy2(CONFIG, folder / "config.yaml")
+    shutil.copy2(ROOT / "config.yaml", folder)
     hopper = {"HopperBulletEnv-v0": {"episodes": 4}}
     tiny = {"seeds": [0, 1], "training": {"episodes": 4}, "environment_settings": hopper}
     (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny), encoding="utf-8")
@@ -106,31 +91,37 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run(study.run_config(env, variant, seed), place)
     command = [sys.executable, "-m", "snakemake", "--snakefile", ROOT / "Snakefile", "--cores", "2"]
     command += ["--allowed-rules", *RULES, "--configfile", "tiny.yaml", "--", "page"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [*command, "results/tables.md"], cwd=folder, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stderr
     return folder
-
-
-@pytest.fixture(scope="module")
-def page(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    """The report, opened."""
-    return opened((made / "results/report.html"), tmp_path_factory.mktemp("browser"))
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("report")]
 
 
-@needs_browser
-def test_every_section_is_there_and_says_what_to_see(page: Page) -> None:
+@pytest.mark.skipif(
+    BROWSER is None and "CI" not in os.environ, reason="needs chromium (Debian: apt install)"
+)
+def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -> None:
+    results = made / "results"
+    command = [BROWSER or "chromium", "--headless", "--no-sandbox", "--disable-gpu"]
+    command += ["--proxy-server=127.0.0.1:9", f"--user-data-dir={tmp_path}/profile"]
+    command += ["--dump-dom", (results / "report.html").as_uri()]
+    dumped = subprocess.run(command, capture_output=True, timeout=120, check=True)
+    page = Page(dumped.stdout.decode())
+
+    # Every section is there and says what to see; references lead somewhere.
     assert [found for found in page.text if found] == SECTIONS
     for section in SECTIONS[:-1]:
         assert "What to see:" in page.words(section), section
-    links = {found["href"] for found in page.all("", "a")}
-    assert {f"#{section}" for section in SECTIONS} <= links
+    ids = [found["id"] for _, _, found in page.elements if "id" in found]
+    used = {found[name] for _, _, found in page.elements for name in found if "href" in name}
+    clips = re.findall(r"url\((#[^)]*)\)", " ".join(str(found) for _, _, found in page.elements))
+    assert len(ids) == len(set(ids)) and {*used, *clips} <= {f"#{name}" for name in ids}
 
-
-@needs_browser
-def test_nothing_is_loaded_from_elsewhere(page: Page, made: Path) -> None:
+    # Nothing is loaded from elsewhere.
     for _, tag, attributes in page.elements:
         assert tag not in ("script", "link", "iframe", "object", "embed", "base"), tag
         for name in ("src", "srcset", "poster", "data", "background"):
@@ -141,71 +132,51 @@ def test_nothing_is_loaded_from_elsewhere(page: Page, made: Path) -> None:
     assert not re.search(r"@import|url\(", page.style.replace("url(#", "#"))
     (policy,) = [found for found in page.all("", "meta") if "http-equiv" in found]
     assert (policy["content"] or "").startswith("default-src 'none'")
-    assert (made / "results/report.html").stat().st_size < MOST_BYTES
+    assert (results / "report.html").stat().st_size < MOST_BYTES
 
-
-@needs_browser
-def test_ids_are_there_once_and_references_lead_somewhere(page: Page) -> None:
-    ids = [found["id"] for _, _, found in page.elements if "id" in found]
-    assert len(ids) == len(set(ids))
-    used = {found[name] for _, _, found in page.elements for name in found if "href" in name}
-    clips = re.findall(r"url\((#[^)]*)\)", " ".join(str(found) for _, _, found in page.elements))
-    assert {*used, *clips} <= {f"#{name}" for name in ids}
-
-
-@needs_browser
-def test_each_claim_has_its_verdicts_and_its_parts(page: Page, made: Path) -> None:
-    ledger = json.loads((made / "results/claims.json").read_text(encoding="utf-8"))["claims"]
-    squares = page.all("verdicts", "td")
-    assert [found["class"] for found in squares] == ["inconclusive"] * 20
-    assert "none is reproduced, none is contradicted and 10 are inconclusive" in page.words(
-        "verdicts"
-    )
-    assert ", as in Acrobot-v1, CartPole-v1, HopperBulletEnv-v0, every part" in page.words(
-        "verdicts"
-    )
+    # Each claim has its verdicts and its parts.
+    ledger = json.loads((results / "claims.json").read_text(encoding="utf-8"))["claims"]
+    assert [found["class"] for found in page.all("verdicts", "td")] == ["inconclusive"] * 20
+    assert "none is reproduced, none is contradicted and 10 are inc" in page.words("verdicts")
+    assert f", as in {', '.join(ENVIRONMENTS)}, every part" in page.words("verdicts")
     claims = page.all("ledger", "details")
     assert [found["id"] for found in claims] == [f"C{n}" for n in range(1, 11)]
-    for record in ledger:
-        assert record["statement"] in page.words("ledger")
+    assert all(record["statement"] in page.words("ledger") for record in ledger)
     rows = sum(len(record[how]["parts"]) for record in ledger for how in (LITERAL, ROBUST))
-    heads = 2 * len(claims)
-    assert len(page.all("ledger", "tr")) == rows + heads
+    assert len(page.all("ledger", "tr")) == rows + 2 * len(claims)
 
-
-@needs_browser
-def test_figures_have_a_panel_for_each_environment(page: Page) -> None:
+    # Figures have a panel for each environment.
     for section, figure in (("learning", "1"), ("beta", "2")):
         found = page.all(section, "figure")
-        assert [(one["data-figure"], one["data-environment"]) for one in found] == [
-            (figure, environment) for environment in ENVIRONMENTS
-        ]
+        shown = [(one["data-figure"], one["data-environment"]) for one in found]
+        assert shown == [(figure, environment) for environment in ENVIRONMENTS]
         assert len(page.all(section, "svg")) == len(ENVIRONMENTS)
-        assert all(environment in page.text[section] for environment in ENVIRONMENTS)
     assert "PPO (Baseline)" not in page.words("beta")
     assert [one["aria-label"] for one in page.all("ranking", "svg")] == ["readings"]
-    shown = [one["aria-label"] for one in page.all("statistics", "svg")]
-    assert shown == ["every seed"]
-    assert "returns shuffled" in page.words("ranking")
+    assert [one["aria-label"] for one in page.all("statistics", "svg")] == ["every seed"]
+    assert [one["aria-label"] for one in page.all("ledger", "svg")] == ["forest"]
 
+    # Tables have the numbers of their files, in the report and on the page of tables.
+    text = (results / "tables.md").read_text(encoding="utf-8")
+    for row in pd.read_csv(results / "table1.csv").itertuples():
+        for said in (page.words("table1"), text):
+            assert f"{row.mean:.0f}" in said and f"{row.low:.0f} to {row.high:.0f}" in said
+    for row in pd.read_csv(results / "comparisons.csv").query("env != 'all'").itertuples():
+        assert number(row.probability, 2) in page.words("statistics")
+    assert len(page.all("costs", "tr")) == 1 + len(ENVIRONMENTS) * len(VARIANTS)
+    assert "18 trainings" in page.words("") and "torch 2." in page.words("workflow")
+    assert "GAE Parameter" in page.words("configuration")
+    for file in ("config.yaml", "tiny.yaml"):
+        content = (made / file).read_text(encoding="utf-8")
+        assert " ".join(content.split()) in page.words("configuration")
 
-@needs_browser
-def test_table_1_has_the_numbers_of_its_file(page: Page, made: Path) -> None:
-    said = page.words("table1")
-    for row in pd.read_csv(made / "results/table1.csv").itertuples():
-        assert f" {row.mean:.0f}" in said and f"{row.low:.0f} to {row.high:.0f}" in said
-        assert " ".join(number(row.paper).split()) in said
-    assert len(page.all("table1", "tr")) == 1 + 3 * (1 + 3)
-
-
-@needs_browser
-def test_each_agent_is_shown_beside_an_untrained_one(page: Page) -> None:
-    shown = {
+    # Each agent is shown beside an untrained one.
+    agents = {
         (one["data-environment"], variant, one["data-trained"])
         for one in page.all("agents", "figure")
         for variant in (one["data-variants"] or "").split()
     }
-    assert shown == {(e, v, yes) for e in ENVIRONMENTS for v in VARIANTS for yes in ("yes", "no")}
+    assert agents == {(e, v, yes) for e in ENVIRONMENTS for v in VARIANTS for yes in ("yes", "no")}
     for image in page.all("agents", "img"):
         kind, _, data = (image["src"] or "").partition(",")
         assert kind == "data:image/gif;base64" and len(data) < 4 / 3 * 400_000
@@ -214,79 +185,48 @@ def test_each_agent_is_shown_beside_an_untrained_one(page: Page) -> None:
             assert film.n_frames > 2 and film.width == 200
 
 
-@needs_browser
-def test_costs_workflow_and_configuration(page: Page, made: Path) -> None:
-    assert len(page.all("costs", "tr")) == 1 + 3 * (1 + 3) + 1
-    steps = pd.read_csv(made / "results/metrics.csv")["env_steps"]
-    assert len(steps) == 18 and " 18 " in page.words("costs")
-    files_of_rules = ROOT.glob("workflow/rules/*.smk")
-    rules = re.findall(r"^rule (\w+):", "".join(p.read_text() for p in files_of_rules), re.M)
-    rules.remove("picture")  # the page draws its own
-    nodes = page.all("workflow", "rect")
-    assert len(nodes) == len(rules) and all(rule in page.words("workflow") for rule in rules)
-    assert "18 runs" in page.words("workflow") and "torch 2." in page.words("workflow")
-    for file in ("config.yaml", "tiny.yaml"):
-        text = (made / file).read_text(encoding="utf-8")
-        assert " ".join(text.split()) in page.words("configuration")
-    assert "gae lambda" in page.words("configuration")
-
-
-@needs_browser
-def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, tmp_path: Path) -> None:
+def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     """From the same files, some left out, with a regret; made twice, it is the same."""
     study = read_study([made / "config.yaml", made / "tiny.yaml"])
-    regret_of = {"variant": "mace_full", "constants": ["ppo", "mace_fixed"]}
-    settings = study.metrics.within(study.environments, study.variants).model_copy(
-        update={"regret": RegretConfig(**regret_of)}
+    chosen = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed"])
+    settings = study.metrics.within(study.environments, study.variants)
+    settings = settings.model_copy(update={"regret": chosen})
+    data, claims = read_data(
+        {path.stem: path for path in (made / "results").glob("*.csv")}, study.runs(), settings
     )
-    results = made / "results"
-    found = {name: results / f"{name}.csv" for name in ("metrics", "table1", "supplement")}
-    found |= {name: results / f"{name}.csv" for name in ("comparisons", "aggregate", "readings")}
-    for figure in "12":
-        found |= {f"curves{figure}": results / f"figure{figure}.csv"}
-        found |= {f"seeds{figure}": results / f"figure{figure}_seeds.csv"}
-    tables = read_tables(found, study.runs(), settings)
-    tables = replace(
-        tables,
-        curves={**tables.curves, "2": tables.curves["2"].head(0)},
-        regret=regret(tables.metrics, settings),
-    )
-    records = [read_record(path) for path in results.glob("runs/*/*/*/run.json")]
-    ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo.model_dump()}
-    making = Making(
-        "a command", {}, {"seeds": [0, 1]}, ppo, graph("train", {"train": []}, {}), records
-    )
-    runs = {("CartPole-v1", variant): tmp_path / f"runs/{variant}" for variant in VARIANTS}
-    films = animations(runs, study.labels, tmp_path)
-    html = [build(tables, making, films, settings, study.labels, study.colours) for _ in range(2)]
-    assert html[0] == html[1]
-    (tmp_path / "report.html").write_text(html[0], encoding="utf-8")
-    page = opened(tmp_path / "report.html", tmp_path)
+    assert not claims
+    data |= {"figure2": data["figure2"].head(0), "regret": regret(data["metrics"], settings)}
+    records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
+    ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
+    making = Making("a command", {}, ppo, records)
+    films = animations({("CartPole-v1", v): made / v for v in VARIANTS}, study.labels, made)
+    how = making, films, settings, study.labels, study.colours
+    html = build(data, claims, *how)
+    assert html == build(data, claims, *how)
+    page = Page(html)
     assert page.words("verdicts").startswith("Verdicts There are no verdicts")
     assert "This study has no ledger" in page.words("ledger")
-    for variant in VARIANTS:
-        assert f"runs/{variant}" in page.words("agents")
-    assert "Not shown, because agent.pt is not there" in page.words("agents")
+    assert f"agent.pt is not there, are the agents of {', '.join(VARIANTS)}" in page.words("agents")
     assert not page.all("agents", "img")
     assert "constants" in [one.get("aria-label") for one in page.all("statistics", "svg")]
     assert "loses against the best constant" in page.words("statistics")
     assert "β is 0 throughout" in page.words("beta")
-    assert "on the command line over them seeds=0, 1" in page.words("configuration")
     # Without the common bar of some environment it is that which is missed, and what is left holds.
     settings = settings.model_copy(update={"reference_return": {}})
     known = {metric.name for metric in all_metrics(settings)}
-    tables = replace(
-        tables,
-        comparisons=tables.comparisons[tables.comparisons["metric"].isin(known)],
-        supplement=tables.supplement[tables.supplement["metric"].isin(known)],
-        readings=tables.readings[tables.readings["reading"].isin(known)],
-    )
-    html = build(tables, making, films, settings, study.labels, study.colours)
-    words = Page(html).words("verdicts")
-    assert "metrics.reference_return has none for some environment" in words
+    for name, column in (
+        ("comparisons", "metric"),
+        ("supplement", "metric"),
+        ("readings", "reading"),
+    ):
+        data[name] = data[name][data[name][column].isin(known)]
+    html = build(data, claims, making, Animations(), settings, study.labels, study.colours)
+    assert "metrics.reference_return has none for some env" in Page(html).words("verdicts")
 
 
-def test_agents_that_do_the_same_untrained_share_a_film(made: Path, tmp_path: Path) -> None:
+def test_agents_that_do_the_same_untrained_share_a_film(
+    made: Path, run_config, tmp_path: Path
+) -> None:
     hopper, seed1 = made / "results/runs/HopperBulletEnv-v0", tmp_path / "seed1"
     runs = {("HopperBulletEnv-v0", variant): hopper / variant / "seed0" for variant in VARIANTS}
     labels = {variant: variant.upper() for variant in VARIANTS}
@@ -303,21 +243,31 @@ def test_agents_that_do_the_same_untrained_share_a_film(made: Path, tmp_path: Pa
     (seed1 / files.AGENT).write_bytes(b"another")
     with pytest.raises(CheckpointError, match=r"agent\.pt: missing, cut off or altered"):
         animations({("HopperBulletEnv-v0", "ppo"): seed1}, labels, tmp_path)
-
-
-def test_an_environment_that_cannot_be_drawn_is_said(run_config, tmp_path: Path) -> None:
-    run(run_config("PlantedHelp-v0", episodes=1), tmp_path)
-    films = animations({("PlantedHelp-v0", "ppo"): tmp_path}, {"ppo": "PPO"}, tmp_path)
+    # An environment that cannot be drawn is said.
+    run(run_config("PlantedHelp-v0", episodes=1), tmp_path / "planted")
+    films = animations({("PlantedHelp-v0", "ppo"): tmp_path / "planted"}, labels, tmp_path)
     assert not films.shown
-    (sentence,) = films.missing
-    assert sentence.startswith("environment 'PlantedHelp-v0' cannot be drawn")
+    assert films.missing[0].startswith("environment 'PlantedHelp-v0' cannot be drawn")
 
 
-def test_a_rule_stands_right_of_what_it_needs() -> None:
-    needs = {"a": [], "b": ["a"], "c": ["a", "b"], "d": [], "e": ["c", "d"]}
-    drawn = graph("e", {**needs, "f": ["a"]}, {"a": "3 runs"})
-    x = {node.rule: node.x for node in drawn.nodes}
-    assert x["a"] < x["b"] < x["c"] == x["d"] < x["e"]
-    assert len({(node.x, node.y) for node in drawn.nodes}) == len(needs)
-    assert len(drawn.curves) == 4  # not from a to c, as b is between
-    assert {node.rule: node.note for node in drawn.nodes}["a"] == "3 runs"
+def test_costs_times_and_too_few_seeds() -> None:
+    records = [
+        {
+            "config": {"environment": "A-v0", "variant": variant, "seed": seed},
+            "seconds": 10.0**seed * (1 + (variant == "full")),
+            "peak_memory_mb": 300 + seed,
+        }
+        for variant in ("ppo", "full")
+        for seed in range(3)
+    ]
+    runs = [record["config"] for record in records]
+    metrics = pd.DataFrame(runs).rename(columns={"environment": "env"}).assign(env_steps=7000)
+    plain, full = _costs(records, metrics[::-1], {"ppo": "PPO", "full": "Full"}).to_numpy().tolist()
+    assert plain == ["A-v0", "PPO", "3", "21", "10.0 s", "1.7 min", "1.9 min", "302"]
+    assert full[-2] == "3.7 min"
+    assert [duration(0.04), duration(7200)] == ["0.0 s", "2.0 h"]
+    assert list(map(short, (0.9921, -83.0, 1841.9, 0.0))) == ["0.992", "−83.0", "1842", "0"]
+    parts = [{"environments": ["A-v0"], "seeds": 10}, {"environments": ["B-v0"], "seeds": 9}]
+    parts += [{"environments": ["B-v0", "C-v0"], "seeds": 3}]
+    found = _too_few([{ROBUST: {"parts": parts}}], ["C-v0", "D-v0", "A-v0", "B-v0"])
+    assert found == ["C-v0", "B-v0"] and _too_few([], ["A-v0"]) == []

@@ -5,6 +5,8 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mace_rl.results import statistics as s
 
@@ -12,35 +14,38 @@ REPETITIONS = 5000
 FIVE = np.array([186.0, 201.0, 249.0, 140.0, 120.0])
 OTHER = np.array([170.0, 230.0, 249.0, 150.0, 95.0])
 TWELVE = np.array([3.0, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5, 8])
+NEVER = np.inf
 
 
 def generator(seed=0):
     return np.random.default_rng(seed)
 
 
+HOW = 0.95, REPETITIONS
+
+
 def interval(values, seed=0):
-    return s.mean_interval(values, 0.95, REPETITIONS, generator(seed))
+    return s.mean_interval(values, *HOW, generator(seed))
 
 
-def test_below_ten_seeds_the_interval_is_students():
-    assert s.interval_kind(9) == "t"
+def paired(x, y):
+    return s.paired_comparison(x, y, *HOW, generator())
+
+
+def expanded(resampled, seeds):
+    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
+    z = scipy.stats.t.ppf(0.975, seeds - 1) * np.sqrt(seeds / (seeds - 1))
+    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))
+
+
+def test_below_ten_seeds_the_interval_is_students_and_then_the_expanded_bootstrap():
+    assert (s.interval_kind(9), s.interval_kind(10)) == ("t", "bootstrap")
     expected = scipy.stats.t.interval(0.95, 4, FIVE.mean(), scipy.stats.sem(FIVE))
     np.testing.assert_allclose(interval(FIVE), expected, rtol=1e-12)
     # By hand: 0 and 2 have mean 1, standard error 1 and t of one degree of freedom 12.706.
     np.testing.assert_allclose(interval(np.array([0.0, 2.0])), (1 - 12.7062, 1 + 12.7062), 1e-4)
-
-
-def test_from_ten_seeds_on_the_interval_is_the_expanded_bootstrap():
-    assert s.interval_kind(10) == "bootstrap"
-    expected = scipy.stats.bootstrap(
-        (TWELVE,),
-        np.mean,
-        n_resamples=REPETITIONS,
-        method="percentile",
-        confidence_level=1 - 2 * scipy.stats.norm.cdf(-np.sqrt(12 / 11) * 2.200985),  # t, 11
-        rng=generator(1),
-    ).confidence_interval
-    np.testing.assert_allclose(interval(TWELVE), expected, atol=0.1)
+    resampled = generator(1).choice(TWELVE, (REPETITIONS, 12)).mean(axis=1)
+    np.testing.assert_allclose(interval(TWELVE), expanded(resampled, 12), atol=0.1)
 
 
 @pytest.mark.parametrize("seeds", [5, 12])
@@ -63,111 +68,100 @@ def test_intervals_cover_the_true_mean_about_as_often_as_they_say(seeds):
     assert 0.82 <= hits / 300 <= 0.95
 
 
-def test_one_seed_allows_no_interval():
+def test_one_seed_allows_no_interval_and_equal_seeds_one_of_no_width():
     assert np.isnan(interval(np.array([5.0]))).all()
     assert np.isnan(interval(np.ones((1, 3)))).all()
-
-
-def test_equal_seeds_give_an_interval_of_no_width():
     for seeds in (2, 9, 10, 30):
         low, high = interval(np.full(seeds, 2000.0))
         assert low == high == 2000
 
 
 def test_paired_comparison_against_scipy_and_enumeration():
-    result = s.paired_comparison(FIVE, OTHER, 0.95, REPETITIONS, generator())
-    difference = FIVE - OTHER
+    result, difference = paired(FIVE, OTHER), FIVE - OTHER
     assert result.difference == pytest.approx(sum(difference) / 5)
-    assert (result.low, result.high) == pytest.approx(
-        scipy.stats.ttest_rel(FIVE, OTHER).confidence_interval(0.95)
-    )
+    expected = scipy.stats.ttest_rel(FIVE, OTHER).confidence_interval(0.95)
+    assert (result.low, result.high) == pytest.approx(expected)
     flips = [abs(np.dot(signs, difference)) for signs in product((-1, 1), repeat=5)]
     assert result.p_value == np.mean(np.array(flips) >= abs(difference.sum()))
+    assert paired(FIVE, FIVE) == (0, 0, 0, 1)
+    for n in (2, 5):
+        assert paired(FIVE[:n] + 1, FIVE[:n]) == (1, 1, 1, 2 / 2**n)
+    one = paired(FIVE[:1], OTHER[:1])
+    assert one.difference == 16 and np.isnan(one[1:]).all()
 
 
 def test_pairing_finds_a_small_difference_behind_large_seed_effects():
     noise = generator(5).normal(size=8) * 1000
     shifted = noise + 1 + generator(6).normal(size=8) * 0.1
-    result = s.paired_comparison(shifted, noise, 0.95, REPETITIONS, generator())
+    result = paired(shifted, noise)
     assert result.low > 0.8
     assert result.p_value == 2 / 2**8  # no smaller p value exists for eight seeds
     assert scipy.stats.ttest_ind(shifted, noise).pvalue > 0.9
 
 
-def test_paired_comparison_at_its_limits():
-    assert s.paired_comparison(FIVE, FIVE, 0.95, REPETITIONS, generator()) == (0, 0, 0, 1)
-    for n in (2, 5):
-        shifted = s.paired_comparison(FIVE[:n] + 1, FIVE[:n], 0.95, REPETITIONS, generator())
-        assert shifted == (1, 1, 1, 2 / 2**n)
-    one = s.paired_comparison(FIVE[:1], OTHER[:1], 0.95, REPETITIONS, generator())
-    assert one.difference == 16
-    assert np.isnan(one[1:]).all()
+def test_stratified_comparison():
+    draws = generator()
+    strata = [draws.normal(1.0, 1, 20), draws.normal(0.2, 3, 12)]
+    found = s.stratified_comparison(strata, 0.95, 10_000, generator())
+    assert found.difference == pytest.approx(np.mean([values.mean() for values in strata]))
+    means = [draws.choice(v, (10_000, len(v))).mean(axis=1) for v in strata]
+    expected = expanded(np.mean(means, axis=0), 12)  # as for the smaller stratum
+    np.testing.assert_allclose((found.low, found.high), expected, atol=0.05 * np.ptp(expected))
+    signs = [draws.choice([-1, 1], (20_000, len(values))) for values in strata]
+    flipped = np.mean([(x * v).mean(axis=1) for x, v in zip(signs, strata, strict=True)], axis=0)
+    assert found.p_value == pytest.approx(np.mean(abs(flipped) >= found.difference), abs=0.02)
+    one = s.paired_comparison(strata[0], np.zeros(20), 0.95, 1000, generator(3))
+    assert s.stratified_comparison(strata[:1], 0.95, 1000, generator(3)) == one
 
 
-def expanded(resampled: list[float], seeds: int) -> np.ndarray:
-    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
-    factor = scipy.stats.t.ppf(0.975, seeds - 1) / scipy.stats.norm.ppf(0.975)
-    z = scipy.stats.norm.ppf(0.975) * factor * np.sqrt(seeds / (seeds - 1))
-    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))
+def test_strata_of_few_seeds_have_students_interval_with_the_freedom_of_the_smallest():
+    draws = generator()
+    strata = [draws.normal(1.0, 1, 5), draws.normal(0.2, 3, 12), draws.normal(0, 2, 12)]
+    found = s.stratified_comparison(strata, 0.95, 1000, generator())
+    error = np.sqrt(sum(scipy.stats.sem(values) ** 2 for values in strata)) / 3
+    centre = np.mean([values.mean() for values in strata])
+    expected = scipy.stats.t.interval(0.95, 4, centre, error)
+    assert (found.low, found.high) == pytest.approx(expected)
 
 
 def test_probability_of_improvement_against_a_loop_and_scipy():
-    probability, low, high = s.probability_of_improvement(
-        [(FIVE, OTHER[:4])], 0.95, REPETITIONS, generator()
-    )
-    wins = [(x > y) + 0.5 * (x == y) for x in FIVE for y in OTHER[:4]]
-    assert probability == sum(wins) / 20
-    u = scipy.stats.mannwhitneyu(FIVE, OTHER[:4], alternative="greater").statistic
-    assert probability == u / 20  # rliable's formula
-    draws = generator(7)
-    resampled = []
-    for _ in range(REPETITIONS):
-        x, y = draws.choice(FIVE, 5), draws.choice(OTHER[:4], 4)
-        resampled.append(np.mean([(a > b) + 0.5 * (a == b) for a in x for b in y]))
-    np.testing.assert_allclose((low, high), expanded(resampled, 4), atol=0.051)
-
-
-def test_probability_of_improvement_over_several_environments():
-    pairs = [(TWELVE, TWELVE[::-1] ** 2 / 5), (TWELVE - 1, TWELVE)]
-    alone = [s.probability_of_improvement([p], 0.95, REPETITIONS, generator()) for p in pairs]
-    probability, low, high = s.probability_of_improvement(pairs, 0.95, REPETITIONS, generator())
-    assert probability == pytest.approx(np.mean([one[0] for one in alone]))
+    """The mean over environments, resampled within each."""
+    pairs = [(TWELVE, TWELVE[:10] ** 2 / 5), (TWELVE - 1, TWELVE)]
+    probability, low, high = s.probability_of_improvement(pairs, *HOW, generator())
+    u = [scipy.stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)) for x, y in pairs]
+    assert probability == pytest.approx(np.mean(u))  # rliable's formula
     draws, resampled = generator(7), []
-    for _ in range(REPETITIONS):  # stratified: every environment's runs among themselves
+    for _ in range(REPETITIONS):
         drawn = [(draws.choice(x, len(x)), draws.choice(y, len(y))) for x, y in pairs]
         resampled.append(np.mean([np.heaviside(np.subtract.outer(*d), 0.5).mean() for d in drawn]))
-    np.testing.assert_allclose((low, high), expanded(resampled, 12), atol=0.03)
+    np.testing.assert_allclose((low, high), expanded(resampled, 10), atol=0.03)
 
 
-def test_probability_of_improvement_at_its_limits():
-    def probability(x, y):
-        return s.probability_of_improvement(
-            [(np.array(x, float), np.array(y, float))], 0.95, REPETITIONS, generator()
-        )
-
-    assert probability([2, 3], [0, 1]) == (1, 1, 1)
-    assert probability([0, 1], [2, 3]) == (0, 0, 0)
-    assert probability([1, 1], [1, 1]) == (0.5, 0.5, 0.5)
-    value, *bounds = probability([2], [1, 3])
-    assert value == 0.5
-    assert np.isnan(bounds).all()
+@pytest.mark.parametrize(
+    ("x", "y", "expected"), [([2, 3], [0, 1], 1), ([0, 1], [2, 3], 0), ([1, 1], [1, 1], 0.5)]
+)
+def test_probability_of_improvement_at_its_limits(x, y, expected):
+    pair = np.array(x, float), np.array(y, float)
+    assert s.probability_of_improvement([pair], *HOW, generator()) == (expected,) * 3
+    value, *bounds = s.probability_of_improvement([(pair[0][:1], pair[1])], *HOW, generator())
+    assert value == expected and np.isnan(bounds).all()
 
 
-def test_holm_by_hand():
-    # Sorted: 0.005 · 4, 0.01 · 3, 0.03 · 2, 0.04 · 1 = 0.02, 0.03, 0.06, then at least 0.06.
+@given(st.lists(st.floats(0, 1), max_size=8))
+def test_holm_against_a_loop(p):
+    # By hand: 0.005 · 4, 0.01 · 3, 0.03 · 2, 0.04 · 1 = 0.02, 0.03, 0.06, then at least 0.06.
     np.testing.assert_allclose(s.holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
-    np.testing.assert_allclose(s.holm([0.5, 0.9]), [1, 1])
-    assert s.holm([0.05]).tolist() == [0.05]
-    assert s.holm([]).tolist() == []
+    ordered, m = sorted(p), len(p)
+    expected = [
+        max(min(1, ordered[i] * (m - i)) for i in range(m) if ordered[i] <= value) for value in p
+    ]
+    assert s.holm(p).tolist() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("p", [[-0.1], [1.1, 0.5], [float("nan")]])
 def test_holm_refuses_what_is_no_p_value(p):
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
         s.holm(p)
-
-
-NEVER = np.inf
 
 
 def observed_minus_expected(x, y):
@@ -180,28 +174,20 @@ def observed_minus_expected(x, y):
     return result
 
 
-@pytest.mark.parametrize(
-    ("x", "y"),
-    [
-        ([1, 2, 3], [4, 5, 6]),
-        ([186, 201, NEVER, 140], [201, NEVER, NEVER]),
-        ([10, 10, 20, NEVER], [10, 30, 30, NEVER, NEVER]),
-        ([5, 40, NEVER], [10, 20, 20, 30, 50, NEVER, NEVER]),
-        ([60, 70], [10, 20, 30, 40, 60, NEVER]),
-    ],
-)
+times = st.lists(st.sampled_from([10, 20, 20, 30, 40, NEVER]), min_size=2, max_size=4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(times, st.lists(st.sampled_from([10, 20, 25, 30, NEVER]), min_size=2, max_size=5))
 def test_logrank_against_enumeration(x, y):
-    n, everything = len(x), [*x, *y]
-    outcomes = []
-    for chosen in combinations(range(len(everything)), n):
+    everything, outcomes = [*x, *y], []
+    for chosen in combinations(range(len(everything)), len(x)):
         rest = [t for place, t in enumerate(everything) if place not in chosen]
         outcomes.append(observed_minus_expected([everything[place] for place in chosen], rest))
     outcomes, found = np.array(outcomes), observed_minus_expected(x, y)
     tails = np.mean(outcomes >= found - 1e-9), np.mean(outcomes <= found + 1e-9)
-    expected = min(1, 2 * min(tails))
-    assert s.logrank(np.array(x, float), np.array(y, float), 9999, generator()) == pytest.approx(
-        expected
-    )
+    p_value = s.logrank(np.array(x, float), np.array(y, float), 9999, generator())
+    assert p_value == pytest.approx(min(1, 2 * min(tails)))
 
 
 def test_logrank_of_many_runs_is_near_scipys_approximation():
@@ -214,10 +200,4 @@ def test_logrank_of_many_runs_is_near_scipys_approximation():
         ]
         expected = scipy.stats.logrank(*censored).pvalue
         assert s.logrank(*seen, 9999, generator()) == pytest.approx(expected, abs=0.02)
-
-
-def test_logrank_at_its_limits():
-    same = np.array([100.0, NEVER])
-    assert s.logrank(np.full(3, NEVER), np.full(3, NEVER), 999, generator()) == 1
-    assert s.logrank(same, same, 999, generator()) == 1
-    assert np.isnan(s.logrank(same[:1], same[1:], 999, generator()))
+    assert np.isnan(s.logrank(x[:1], y[:1], 999, generator()))

@@ -1,4 +1,4 @@
-"""Tables and comparisons from a small frame: numbers against scipy, LaTeX by its structure."""
+"""Every table from small frames: numbers against scipy, three renderings of the same cells."""
 
 import os
 import re
@@ -11,94 +11,74 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import table_for_tables
+from hypothesis import given
+from hypothesis import strategies as st
+from invented import table_for_claims, table_for_tables
 
 from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.study import read_study
-from mace_rl.results.latex import escaped, supplement_latex, table1_latex, table2_latex
+from mace_rl.results import tables
+from mace_rl.results.aggregate import aggregate
+from mace_rl.results.claims import LITERAL, ROBUST, ledger
+from mace_rl.results.comparisons import comparisons, regret
+from mace_rl.results.latex import supplement_latex, table1_latex, table2_latex
 from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1
-from mace_rl.results.paper import VARIANTS as PAPER_VARIANTS
-from mace_rl.results.tables import supplement, table1
+from mace_rl.results.pages import claims_page, tables_page
+from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1, VARIANTS
+from mace_rl.results.renderings import (
+    Cell,
+    Value,
+    as_html,
+    escaped,
+    estimate,
+    latex_cell,
+    markdown,
+    number,
+)
+from mace_rl.results.summary import supplement, table1
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
 metrics = partial(table_for_tables, all_metrics(SETTINGS))
-PAPER, VARIANTS = list(ENVIRONMENTS), list(PAPER_VARIANTS)
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
 WORST = Metric("worst", "Worst & last", "return", lambda curve: curve.returns.min())
 PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(
-    update={
-        "entropy_coefficient": 1e-05,
-        "hidden_units": [64, 32],
-        "gae_lambda": 1.0,
-        "normalise_observations": False,
-    }
+    update={"entropy_coefficient": 1e-05, "hidden_units": [64, 32], "gae_lambda": 1.0}
 )
 
 
-def cells(fragment):
-    """{(variant or row label, place of the column): cell}, as printed."""
-    found = {}
-    for line in fragment.splitlines():
-        if line.startswith(r"\raggedright"):
-            label, *values = line.removeprefix(r"\raggedright ").removesuffix(r" \\").split(" & ")
-            label = label.replace(r"\newline ", " ").replace(r"$\beta$", "β")
-            name = next((name for name in LABELS if LABELS[name] == label), label)
-            found |= {(name, place): value for place, value in enumerate(values)}
-    return found
+def cells(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
+    """{(first cell of the row, column): cell} as Markdown prints it."""
+    head, _, *lines = markdown(frame).splitlines()
+    columns = [name.strip() for name in head.split("|")[2:-1]]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    return {
+        (row, name): cell for row, *rest in rows for name, cell in zip(columns, rest, strict=True)
+    }
 
 
-def test_summary_against_pandas_and_scipy():
+def table1_of(**values: object) -> dict[tuple[str, str], str]:
+    """The cells of Table 1 for CartPole."""
+    variants = list(next(iter(values.values())))  # type: ignore[call-overload]
+    return cells(tables.table1(table1(metrics(["CartPole-v1"], variants, **values), SETTINGS)))
+
+
+def test_summary_against_pandas_and_scipy() -> None:
     frame = metrics(seeds=5)
     result = table1(frame, SETTINGS)
     assert len(result) == 3 * 3 * 2
     for row in result.itertuples():
         values = frame.query("env == @row.env and variant == @row.variant")[row.metric]
-        assert row.mean == pytest.approx(values.mean())
         low, high = scipy.stats.t.interval(0.95, 4, values.mean(), values.sem())
-        assert (row.low, row.high) == pytest.approx((max(low, 1), min(high, 2000)))
+        expected = values.mean(), max(low, 1), min(high, 2000)
+        assert (row.mean, row.low, row.high) == pytest.approx(expected)
         assert (row.seeds, row.censored, row.episodes) == (5, 0, 2000)
+        assert row.paper == PAPER_TABLE1[row.env, row.variant][row.metric == "convergence_steps"]
+    other = table1(metrics(["Pendulum-v1"], ["ppo"]), SETTINGS)
+    assert other["paper"].isna().all()
 
 
-def test_the_interval_of_a_share_ends_at_0_and_1():
-    own = SETTINGS.model_copy(update={"solved_return": {"CartPole-v1": 475.0}})
-    frame = metrics(["CartPole-v1"], ["ppo"]).assign(solved=[0.0, 1.0, 1.0])
-    row = supplement(frame, own).set_index("metric").loc["solved"]
-    assert (row["mean"], row["low"], row["high"]) == (pytest.approx(2 / 3), 0, 1)
-    fragment = supplement_latex(supplement(frame, own), {}, own)
-    assert r"0.67\\{\scriptsize [0.00,\,1.00]}" in cells(fragment)["Solved at the end", 0]
-
-
-def test_the_papers_numbers_stand_beside_ours():
-    result = table1(metrics(["CartPole-v1", "Pendulum-v1"], ["ppo", "mace_fixed_0.2"]), SETTINGS)
-    papers = result.set_index(["env", "variant", "metric"])["paper"]
-    assert papers["CartPole-v1", "ppo", "sample_efficiency"] == 140
-    assert papers["CartPole-v1", "ppo", "convergence_steps"] == 660
-    assert papers.isna().sum() == 6
-    # Table 1 of the paper, read across its rows.
-    across = [PAPER_TABLE1[environment, variant] for variant in VARIANTS for environment in PAPER]
-    assert across == [
-        *((186, 617), (140, 660), (865, 1841)),
-        *((201, 595), (120, 620), (782, 1801)),
-        *((249, 586), (104, 634), (495, 1799)),
-    ]
-
-
-def test_censored_runs_are_counted_and_kept():
-    frame = metrics(
-        ["Acrobot-v1"],
-        ["ppo"],
-        sample_efficiency={"ppo": [100, 2000, 2000]},
-        sample_efficiency_censored={"ppo": [0, 1, 1]},
-    )
-    row = table1(frame, SETTINGS).iloc[0]
-    assert row["mean"] == pytest.approx(4100 / 3)
-    assert row["censored"] == 2
-    assert r"\textbf{1367}$^{\dagger2}$" in table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
-
-
-def test_no_cell_depends_on_another_environment_or_variant():
+def test_no_cell_depends_on_another_environment_or_variant() -> None:
     """Bootstrap intervals included: more columns do not change a number."""
     all_of_it = metrics(seeds=12)
     part = all_of_it[(all_of_it["env"] == "CartPole-v1") & (all_of_it["variant"] == "mace_full")]
@@ -107,141 +87,98 @@ def test_no_cell_depends_on_another_environment_or_variant():
     pd.testing.assert_frame_equal(alone, among.reset_index(drop=True), check_exact=True)
 
 
-def test_table1_has_the_papers_layout():
-    frame = metrics(
-        ["CartPole-v1"],
-        sample_efficiency={"ppo": [1, 2, 3], "mace_fixed": [120] * 3, "mace_full": [104] * 3},
-        convergence_steps={"ppo": [660] * 3, "mace_fixed": [620] * 3, "mace_full": [634] * 3},
+def test_table_1_has_bold_ties_censored_means_and_the_papers_numbers() -> None:
+    speeds = {"ppo": [1, 2, 3], "mace_fixed": [120] * 3, "mace_full": [104] * 3}
+    ends = {"ppo": [600] * 3, "mace_fixed": [600, 600, 601], "mace_full": [2000] * 3}
+    failed = {"ppo": [0] * 3, "mace_fixed": [0] * 3, "mace_full": [1] * 3}
+    found = table1_of(
+        sample_efficiency=speeds, convergence_steps=ends, convergence_steps_censored=failed
     )
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
-    found = cells(fragment)
-    assert [name for name, _ in found] == list(LABELS)
     # Mean 2, standard error 1 / √3, t of two degrees of freedom 4.303: 2 ± 2.48, but not below 1.
-    assert r"\textbf{2} / 660\\{\scriptsize [1,\,4]/[660,\,660]}" in found["ppo", 0]
-    assert r"120 / \textbf{620}\\" in found["mace_fixed", 0]
-    assert r"104 / 634\\" in found["mace_full", 0]
-    assert r"Algorithm & CartPole-v1 \\" in fragment
-    assert r"Means over 3 seeds and, below, their 95\,\% $t$ intervals." in fragment
-    assert "Training budget: 2000 episodes (CartPole-v1)." in fragment
-    assert "dagger" not in fragment
+    assert found == {
+        ("ppo", "CartPole-v1"): "**2** / **600** (1 to 4 / 600 to 600); paper: 140 / 660",
+        ("mace_fixed", "CartPole-v1"): "120 / **600** (120 to 120 / 599 to 602); paper: 120 / 620",
+        ("mace_full", "CartPole-v1"): "104 / 2000†3 (104 to 104 / 2000 to 2000); paper: 104 / 634",
+    }
 
 
-def test_ties_are_all_bold_as_displayed():
-    frame = metrics(
-        ["CartPole-v1"],
-        sample_efficiency={"ppo": [104, 104, 105], "mace_fixed": [104] * 3, "mace_full": [105] * 3},
-        convergence_steps={variant: [600] * 3 for variant in VARIANTS},
+def test_a_mean_of_seeds_that_all_failed_is_never_the_best() -> None:
+    ends = {"ppo": [1999, 2000, 2000], "mace_full": [2000] * 3}
+    found = table1_of(
+        convergence_steps=ends, convergence_steps_censored={"ppo": [0, 1, 1], "mace_full": [1] * 3}
     )
-    found = cells(table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS))
-    assert r"\textbf{104} / \textbf{600}" in found["ppo", 0]  # 104.33 is shown as 104
-    assert r"\textbf{104} / \textbf{600}" in found["mace_fixed", 0]
-    assert r"}105 / \textbf{600}" in found["mace_full", 0]
+    assert " / **2000†2** (" in found["ppo", "CartPole-v1"]  # shown as the same number
+    assert " / 2000†3 (" in found["mace_full", "CartPole-v1"]
 
 
-def test_a_mean_of_seeds_that_all_failed_is_never_the_best():
-    frame = metrics(
-        ["CartPole-v1"],
-        ["ppo"],
-        convergence_steps={"ppo": [2000] * 3},
-        convergence_steps_censored={"ppo": [1] * 3},
+def test_companions_have_the_digits_of_their_largest_mean_and_the_users_own_metrics() -> None:
+    own = SETTINGS.model_copy(
+        update={"custom": [f"{__name__}:WORST"], "solved_return": {"DeepSea10-v0": 0.5}}
     )
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
-    assert r" / 2000$^{\dagger3}$" in cells(fragment)["ppo", 0]
-    assert "a lower bound" in fragment
-    # Nor where the best mean, of a variant that got there once, is shown as the same number.
-    frame = metrics(
-        ["CartPole-v1"],
-        ["ppo", "mace_full"],
-        convergence_steps={"ppo": [1999, 2000, 2000], "mace_full": [2000] * 3},
-        convergence_steps_censored={"ppo": [0, 1, 1], "mace_full": [1] * 3},
-    )
-    found = cells(table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS))
-    assert r" / \textbf{2000}$^{\dagger2}$" in found["ppo", 0]
-    assert r" / 2000$^{\dagger3}$" in found["mace_full", 0]
-
-
-def test_one_seed_has_no_interval():
-    fragment = table1_latex(table1(metrics(seeds=1), SETTINGS), LABELS, SETTINGS)
-    assert r"{\scriptsize --/--}" in fragment
-    assert "One seed, which allows no interval." in fragment
-    assert "nan" not in fragment
-
-
-def test_the_caption_names_the_interval_and_every_budget():
-    frame = metrics(seeds=10)
-    frame.loc[frame["env"] == "HopperBulletEnv-v0", "episodes"] = 6000
-    fragment = table1_latex(table1(frame, SETTINGS), LABELS, SETTINGS)
-    assert r"Means over 10 seeds and, below, their 95\,\% bootstrap intervals." in fragment
-    assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
-
-
-@pytest.mark.parametrize(
-    ("fewest", "expected"),
-    [
-        (10, r"Means over 10 to 12 seeds and, below, their 95\,\% bootstrap intervals."),
-        (5, r"Means over 5 to 12 seeds and, below, their 95\,\% $t$ (below 10 seeds) or bootstrap"),
-        (1, r"their 95\,\% bootstrap intervals; one seed allows none. Training"),
-    ],
-)
-def test_the_caption_of_different_seeds_holds_for_all_of_them(fewest, expected):
-    frame = metrics(seeds=12)
-    few = (frame["env"] != "HopperBulletEnv-v0") | (frame["seed"] < fewest)
-    assert expected in table1_latex(table1(frame[few], SETTINGS), LABELS, SETTINGS)
-
-
-def test_small_returns_have_more_digits_and_zero_has_no_sign():
-    frame = metrics(["DeepSea10-v0"], ["ppo", "mace_full"], seeds=2)
+    frame = metrics(["DeepSea10-v0"], ["ppo", "mace_full"]).assign(worst=-7.0)
     small = frame["variant"] == "ppo"
     frame["final_return"] = np.where(small, 0.6934, -0.0001)
     frame["early_return"] = np.where(small, -0.0032, -0.0021)
-    frame["area_under_curve"] = 0.0
-    found = cells(supplement_latex(supplement(frame, SETTINGS), {}, SETTINGS))
-    rows: dict[str, list[str]] = {}
-    for (name, _), cell in found.items():
-        rows.setdefault(name, []).append(re.search(r"c@\{\}\}(.*?)\\\\", cell)[1])
-    assert rows["Final return"] == ["0.693", "0.000"]
-    assert rows["Mean return of the beginning"] == ["$-$0.00320", "$-$0.00210"]
-    assert rows["Mean return of training"] == ["0.0", "0.0"]
-
-
-def test_more_than_three_environments_continue_below():
-    environments = [*PAPER, "Under_score-v0", "Pendulum-v1"]
-    fragment = table1_latex(table1(metrics(environments), SETTINGS), {}, SETTINGS)
-    heads = re.findall(r"Algorithm & (.*) \\\\", fragment)
-    assert heads == [" & ".join(PAPER), r"Under\_score-v0 & Pendulum-v1"]
-    assert fragment.count("mace\\_full &") == 2
-
-
-def test_the_supplement_has_every_companion():
-    fragment = supplement_latex(supplement(metrics(), SETTINGS), LABELS, SETTINGS)
-    found = cells(fragment)
-    assert [name for name, place in found if place == 0] == [
-        "Final return",
-        "Mean return of training",
-        "Mean return of the beginning",
-        "Sample efficiency (common bar)",
-        "Sample efficiency (range)",
-        "Convergence (range)",
-        "Convergence (steepest)",
-        "Convergence (flattest)",
-        "Convergence (public code)",
+    frame["solved"] = [0.0, 1.0, 1.0] * 2
+    found = cells(tables.companions(supplement(frame, own), own)["DeepSea10-v0"])
+    shown = {name: (found[name, "ppo"], found[name, "mace_full"]) for name, _ in found}
+    assert shown["Final return"] == ("0.693 (0.693 to 0.693)", "0.000 (0.000 to 0.000)")
+    assert [text.split()[0] for text in shown["Mean return of the beginning"]] == [
+        *("−0.00320", "−0.00210")
     ]
-    assert r"$-$85.2\\{\scriptsize [$-$85.2,\,$-$85.2]}" in found["Final return", 0]
-    assert "." not in found["Convergence (range)", 0]
-    captions = re.findall(r"\\caption{(.*), the companion metrics\. Means over 3 seeds", fragment)
-    assert captions == PAPER
-    assert len(set(re.findall(r"\\label{(.*)}", fragment))) == fragment.count(r"\label") == 3
-    own = SETTINGS.model_copy(update={"custom": [f"{__name__}:WORST"]})
-    frame = metrics(["CartPole-v1"]).assign(worst=-7.0)
-    fragment = supplement_latex(supplement(frame, own), LABELS, own)
-    assert r"$-$7.00\\" in cells(fragment)[r"Worst \& last", 0]
+    assert shown["Solved at the end"] == ("0.67 (0.00 to 1.00)",) * 2  # the ends of a share
+    assert shown["Worst & last"] == ("−7.00 (−7.00 to −7.00)",) * 2
+    assert "." not in shown["Convergence (range)"][0]
+    names = {metric.label for metric in all_metrics(own)} - {"Sample efficiency", "Convergence"}
+    assert set(shown) == names
 
 
-def test_table2_has_the_papers_rows_then_ours():
-    changes = {"gae_lambda": 0.95, "normalise_observations": True}
-    changes["network"] = TorchModule(kind="torch", module="my_nets:layer_norm")
-    hopper = PPO.model_copy(update=changes)
-    fragment = table2_latex({"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": hopper})
+def test_returns_worst_seeds_and_solved_tasks_by_variant_and_environment() -> None:
+    frame = metrics(["A-v0", "B-v0"], ["ppo", "mace_full"], seeds=3)
+    frame["final_return"] = np.arange(len(frame)) - 3.0
+    frame["solved"] = [0.9, 1.0, 0.89] * 4
+    frame = frame[(frame["env"] != "B-v0") | (frame["variant"] != "ppo")]
+    means = tables.named(supplement(frame, SETTINGS), LABELS)
+    found = cells(tables.means(means, "final_return", SETTINGS))
+    assert found["PPO (Baseline)", "A-v0"].startswith("−2.00 (")
+    assert found["MACE-RL (Full)", "B-v0"].startswith("7.00 (")
+    assert found["PPO (Baseline)", "B-v0"] == ""
+    worst = cells(tables.worst(frame, SETTINGS))
+    assert worst == {
+        ("ppo", "A-v0"): "−3.00",
+        ("ppo", "B-v0"): "",
+        ("mace_full", "A-v0"): "0.00",
+        ("mace_full", "B-v0"): "6.00",
+    }
+    assert cells(tables.solved(frame))["mace_full", "B-v0"] == "2 of 3"
+
+
+def test_betas_are_of_runs_in_which_beta_changes() -> None:
+    frame = pd.DataFrame(
+        {
+            "env": "A-v0",
+            "variant": ["ppo", "ppo", "mace_full", "mace_full"],
+            "seed": [0, 1, 0, 1],
+            "beta_end": [0, 0, 0.9, 0.125],
+            "beta_lowest": [0, 0, 0.25, 0.1],
+            "beta_highest": [0, 0, 1.0, 0.9],
+            "stagnation_correlation": [0.0, 0, 0.5, 0.25],
+        }
+    )
+    (row,) = tables.betas(frame, SETTINGS).to_numpy()
+    low, high = scipy.stats.t.interval(0.95, 1, 0.375, 0.125)
+    assert list(row[:2]) == ["A-v0", "mace_full"] and list(row[3:5]) == ["0.12, 0.90", "0.10, 0.25"]
+    assert row[5].values == [estimate(0.375, low, high, 3)]
+
+
+def test_table_2_has_the_papers_rows_then_ours() -> None:
+    changes = {
+        "gae_lambda": 0.95,
+        "network": TorchModule(kind="torch", module="my_nets:layer_norm"),
+    }
+    fragment = table2_latex(
+        {"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": PPO.model_copy(update=changes)}
+    )
     paper, ours = fragment.split(r"\midrule")[1:]
     assert re.findall(r"\\raggedright (.*) \\\\", paper) == [
         "Actor Learning Rate & 0.0003",
@@ -252,71 +189,141 @@ def test_table2_has_the_papers_rows_then_ours():
         "Optimizer & Adam",
     ]
     assert r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)" in ours
-    assert r"no (Acrobot-v1, A\_b-v0)\\yes (Hopper)" in ours
-    assert r"Entropy Coefficient & $1 \times 10^{-5}$ \\" in ours
+    assert r"Entropy Coefficient & 1 $\times$ 10$^-$$^5$ \\" in ours
     assert r"tanh network (Acrobot-v1, A\_b-v0)\\my\_nets:layer\_norm (Hopper)" in ours
-    assert "& 64, 32 " in ours
-    assert "None" not in ours
+    assert "& 64, 32 " in ours and "None" not in ours
     # Every setting is there: five of the paper's rows and Adam, and a row for each of the others.
     assert fragment.count("raggedright") == len(PPOConfig.model_fields) + 1
 
 
-def test_special_characters_are_escaped_once():
+@pytest.mark.parametrize(
+    ("fewest", "expected"),
+    [
+        (12, r"Means over 12 seeds and, below, their 95\,\% bootstrap intervals."),
+        (10, r"Means over 10 to 12 seeds and, below, their 95\,\% bootstrap intervals."),
+        (5, r"Means over 5 to 12 seeds and, below, their 95\,\% $t$ (below 10 seeds) or bootstrap"),
+        (1, r"their 95\,\% bootstrap intervals; one seed allows none. Training"),
+    ],
+)
+def test_the_caption_names_intervals_and_budgets(fewest: int, expected: str) -> None:
+    frame = metrics(seeds=12)
+    hopper = frame["env"] == "HopperBulletEnv-v0"
+    frame.loc[hopper, "episodes"] = 6000
+    fragment = table1_latex(
+        table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS), {}, SETTINGS
+    )
+    assert expected in fragment
+    assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
+    assert "nan" not in fragment and (r"{\scriptsize --/--}" in fragment) == (fewest == 1)
+
+
+@given(st.floats(-1e9, 1e9), st.integers(0, 5))
+def test_a_number_reads_back_as_itself_rounded(value: float, digits: int) -> None:
+    text = number(value, digits)
+    read = float(text.replace("−", "-"))
+    assert abs(read - value) <= 0.5001 * 10**-digits and not text.startswith("−0.0 ")
+    assert "-" not in text and (read != 0 or "−" not in text)
+    assert len(text.partition(".")[2]) == digits
+    assert number(None) == number(float("nan"), digits) == "–"
+
+
+CELL = Cell([Value("−2", "−3", "4", "†1", best=True), Value("5", "–", "–")], note="paper: <7>")
+
+
+def test_a_cell_in_each_rendering() -> None:
+    frame = pd.DataFrame([["a & b|c", CELL]], columns=["", "x<y"])
+    assert markdown(frame).splitlines()[2] == (
+        r"| a & b\|c | **−2†1** / 5 (−3 to 4 / – to –); paper: <7> |"
+    )
+    html = as_html(frame)
+    assert '<td class="left">a &amp; b|c</td>' in html and "<th>x&lt;y</th>" in html
+    assert '<span class="nowrap best">−2<sup>†1</sup></span> / ' in html
+    assert "<small>−3 to 4 / – to –</small><small>paper: &lt;7&gt;</small>" in html
+    assert latex_cell(CELL) == (
+        r"\begin{tabular}[t]{@{}c@{}}\textbf{$-$2}$^{\dagger1}$ / 5"
+        r"\\{\scriptsize [$-$3,\,4]/--}\end{tabular}"
+    )
+
+
+def test_special_characters_are_escaped_once() -> None:
     assert escaped(r"a_b & 50 % β ~ \x {1} #2 $3^4 λ") == (
         r"a\_b \& 50 \% $\beta$ \textasciitilde{} \textbackslash{}x \{1\} \#2"
         r" \$3\textasciicircum{}4 $\lambda$"
     )
 
 
-def fragments():
-    many = metrics([*PAPER, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
+@pytest.mark.skipif(
+    shutil.which("pdflatex") is None and "CI" not in os.environ, reason="needs pdflatex"
+)
+def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> None:
+    many = metrics([*ENVIRONMENTS, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
     many["sample_efficiency"] += 1000  # four digits in every cell are the widest there are
     many["episodes"] = 6000
     labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
-    return [
+    fragments = [
         table1_latex(table1(many, SETTINGS), labels, SETTINGS),
         table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS),
         supplement_latex(supplement(many, SETTINGS), labels, SETTINGS),
         table2_latex({"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})}),
     ]
-
-
-FRAGMENTS = dict(zip(("table1", "one seed", "supplement", "table2"), fragments(), strict=True))
-
-
-@pytest.mark.parametrize("fragment", FRAGMENTS.values(), ids=FRAGMENTS)
-def test_the_latex_is_balanced(fragment):
-    assert fragment.isascii()
-    bare = re.sub(r"\\[\\{}]", "", fragment)
-    assert bare.count("{") == bare.count("}")
-    stack = []
-    for kind, name in re.findall(r"\\(begin|end)\{([a-z*]+)\}", fragment):
-        if kind == "begin":
-            stack.append(name)
-        else:
-            assert stack.pop() == name
-    assert not stack
-    body = re.sub(r"(?s)\\begin\{tabular\}\[t\].*?\\end\{tabular\}", "", fragment)
-    for part in re.findall(r"(?s)\\toprule\n(.*?)\\bottomrule", body):
-        rows = [row for row in part.splitlines() if "&" in row]
-        assert len({len(re.findall(r"(?<!\\)&", row)) for row in rows}) == 1
-    # After \\ a bracket would be read as an optional argument.
-    assert not re.search(r"\\\\\s*[\[*]", fragment)
-
-
-@pytest.mark.skipif(
-    shutil.which("pdflatex") is None and "CI" not in os.environ, reason="needs pdflatex"
-)
-@pytest.mark.parametrize("fragment", FRAGMENTS.values(), ids=FRAGMENTS)
-def test_pdflatex_compiles_it_within_the_margins(fragment, tmp_path):
-    document = (
+    assert re.findall(r"Algorithm & (.*) \\\\", fragments[0]) == [
+        *(" & ".join(ENVIRONMENTS), r"Under\_score-v0 & MountainCarContinuous-v0")  # below
+    ]
+    body = "\n".join(fragments)
+    assert body.isascii() and body.count(r"\label") == 2 + 5 + 1
+    (tmp_path / "page.tex").write_text(
         "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n"
-        f"{fragment}\\end{{document}}\n"
+        f"{body}\\end{{document}}\n"
     )
-    (tmp_path / "page.tex").write_text(document)
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout
-    assert "Overfull \\hbox" not in run.stdout
-    assert "Float too large" not in run.stdout
-    assert "Missing character" not in run.stdout
+    for trouble in ("Overfull \\hbox", "Float too large", "Missing character"):
+        assert trouble not in run.stdout
+
+
+def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_files() -> None:
+    runs = metrics(seeds=10)
+    chosen = {"variant": "mace_full", "constants": ["ppo", "mace_fixed"]}
+    settings = type(SETTINGS).model_validate(SETTINGS.model_dump() | {"regret": chosen})
+    kinds = {"table1": table1, "supplement": supplement, "comparisons": comparisons}
+    kinds |= {"aggregate": aggregate, "regret": regret}
+    data = {name: make(runs, settings) for name, make in kinds.items()}
+    beta = {
+        "beta_end": 0.5,
+        "beta_lowest": runs["seed"] / 10,
+        "beta_highest": 0.6,
+        "stagnation_correlation": 0,
+    }
+    data |= {"metrics": runs, "betas": runs[["env", "variant", "seed"]].assign(**beta)}
+    equal = dict.fromkeys(VARIANTS, 0.0)
+    claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS)
+    page = tables_page(data, claims, ["figure1"], settings, "Made by hand.")
+    sections = re.findall("(?m)^## (.*)", page)
+    assert len(sections) == len(set(sections)) and {LITERAL, ROBUST} == {
+        name.removeprefix("Part by part: ") for name in sections if name.startswith("Part")
+    }
+    assert "![figure1](figure1.png)" in page and "Made by hand." in page
+    assert f"{LITERAL}: 0 reproduced, 10 contradicted, 0 inconclusive" in page
+    row = data["comparisons"].set_index(["env", "metric", "variant", "baseline"])
+    row = row.loc["CartPole-v1", "area_under_curve", "mace_full", "ppo"]
+    low, high = number(row["probability_low"], 2), number(row["probability_high"], 2)
+    assert f"{number(row['probability'], 2)} ({low} to {high})" in page
+    assert f"| {number(row['p_value'], 4)} | {number(row['p_holm'], 4)} |" in page
+    lost = data["regret"].iloc[0]
+    assert f"| CartPole-v1 | {lost['best_constant']} |" in page.replace("Acrobot", "CartPole")
+    score = data["aggregate"].iloc[0]
+    assert f"{number(score['mean'], 3)} ({number(score['mean_low'], 3)} to" in page
+    assert f"| mace_full | 10 | {', '.join(['0.50'] * 10)} |" in page
+    # A study without them: no claims, nothing to compare, one environment, β as it was set.
+    alone = {name: make(runs.iloc[:10], settings) for name, make in list(kinds.items())[:4]}
+    alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}
+    page = tables_page(alone, None, [], SETTINGS, "")
+    assert not re.search("who is better|claims|environments together|## β|!\\[|nan", page)
+    parts = [part for claim in claims for part in claim[ROBUST]["parts"]]
+    ledger_page = claims_page(claims, "a command")
+    assert ledger_page.startswith("# Does it hold?\n\na command The rule")
+    for part in parts:
+        digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+        shown = (number(part[name], digits) for name in ("difference", "low", "high"))
+        assert "{} ({} to {})".format(*shown) in ledger_page

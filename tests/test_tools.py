@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 from shared import Bonanza, message
 
-from tools import convergence_simulation, random_return, show
-
-ROOT = Path(__file__).parents[1]
+from tools import convergence_simulation, random_return
 
 
 @pytest.mark.parametrize(
@@ -63,25 +61,6 @@ def test_a_random_return_is_that_of_the_study_s_environment(
     monkeypatch.setattr("sys.argv", ["random_return", name, "40", str(tmp_path / "short.yaml")])
     random_return.main()
     assert float(capsys.readouterr().out.split()[1]) == pytest.approx(50, abs=4)
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["ledger", "nowhere"], "nowhere/claims.json: No such file or directory"),
-        (["means", "study", "speed"], "there is no 'speed' in what study has"),
-        (["parts", "study", "fancy"], "there is no 'fancy' in what study has"),
-        (["improvement", "study", "speed"], "study/comparisons.csv has no metric 'speed'"),
-        (["ledger", "study", "more"], "ledger does not take 'more'"),
-        (["together", "study"], "together wants a variant and those to compare it with"),
-        (["together", "study", "ppo", "other"], "no environment has runs of both 'ppo' and"),
-    ],
-)
-def test_what_is_not_there_to_be_shown(
-    monkeypatch: pytest.MonkeyPatch, words: list[str], expected: str
-) -> None:
-    monkeypatch.chdir(ROOT / "reference" / "tables")
-    assert message(monkeypatch, show, *words).startswith(f"show: {expected}")
 
 
 @pytest.mark.parametrize(

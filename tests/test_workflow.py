@@ -32,16 +32,18 @@ TINY = {  # instead of what config.yaml has
 }
 RUNS = [f"runs/{env}/{variant}/seed0" for env in ENVIRONMENTS for variant in VARIANTS]
 OUTPUTS = [
-    *("metrics.csv", "comparisons.csv", "aggregate.csv", "table1.tex", "table1.csv", "table2.tex"),
-    *("supplement.tex", "supplement.csv", "figure1.csv", "figure1_seeds.csv", "figure2.csv"),
-    *("figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"),
-    *("every_seed.csv", "every_seed.pdf", "every_seed.png"),
+    *("metrics.csv", "betas.csv", "tables.md", "comparisons.csv", "aggregate.csv", "table1.tex"),
+    *("table1.csv", "table2.tex", "supplement.tex", "supplement.csv", "figure1.csv"),
+    *("figure1_seeds.csv", "figure2.csv", "figure1.pdf", "figure1.png", "figure2.pdf"),
+    "figure2.png",
+    *("every_seed.pdf", "every_seed.png", "every_seed.csv"),
     *("readings.csv", "readings.md", "readings.pdf", "readings.png"),
     *(f"{run}/{name}" for run in RUNS for name in ("episodes.csv", "diagnostics.csv", "agent.pt")),
 ]
-EVALUATION = {"metrics": 1, "table1": 1, "comparisons": 1, "aggregate": 1}
+EVALUATION = {"metrics": 1, "tables": 1, "tables_page": 1}
+EVALUATION |= {"figure": 2, "picture": 1, "readings": 1}
+TABLES = {"tables": 1, "tables_page": 1}
 DRAWN = {"figure": 2, "picture": 1, "readings": 1}
-EVALUATION |= DRAWN
 
 
 class Project:
@@ -174,7 +176,7 @@ TRAIN = {"train": 6, **EVALUATION}
 CHANGES = {  # of a file, from one text to another, and what is to be done then
     "a colour": ("config.yaml", "tab:blue", "tab:cyan", DRAWN),
     "the colour of a variant that is not run": ("config.yaml", "tab:purple", "tab:pink", {}),
-    "a name": ("config.yaml", "PPO (", "Plain PPO (", {"table1": 1} | DRAWN),
+    "a name": ("config.yaml", "PPO (", "Plain PPO (", TABLES | DRAWN),
     "how runs are measured": ("config.yaml", "threshold: 0.75", "threshold: 0.7", EVALUATION),
     "what all use": ("config.yaml", "clip: 0.2", "clip: 0.3", TRAIN | {"table2": 1}),
     "what the bonus uses": (
@@ -199,13 +201,21 @@ CHANGES = {  # of a file, from one text to another, and what is to be done then
     "one environment less": ("config.yaml", ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
     "code of PPO": ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN),
     "code of the LSTM": ("src/mace_rl/beta/lstm.py", "\n", "\n\n", TRAIN),
-    "code of tables": ("src/mace_rl/results/tables.py", "\n", "\n\n", {"table1": 1, "table2": 1}),
-    "code of figures": ("src/mace_rl/results/figures.py", "\n", "\n\n", DRAWN),
+    "code of tables": (
+        "src/mace_rl/results/tables.py",
+        "\n",
+        "\n\n",
+        {**TABLES, "table2": 1, "readings": 1},
+    ),
+    "code of figures": (
+        *("src/mace_rl/results/figures.py", "\n", "\n\n"),
+        DRAWN | {"table2": 1} | TABLES,
+    ),
     "code of progress": ("src/mace_rl/runs/progress.py", "\n", "\n\n", {}),
     "a script": ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
     "a result": (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),
-        {"table1": 1, "comparisons": 1, "aggregate": 1, "picture": 1},
+        {**TABLES, "picture": 1},
     ),
 }
 

@@ -134,7 +134,7 @@ def tabulate(folder: Path) -> None:
 
     from mace_rl.cli import CONFIG
     from mace_rl.config.study import read_study
-    from mace_rl.results import figures, latex, tables
+    from mace_rl.results import figures, latex, summary
     from mace_rl.results.metrics_table import metrics_table
     from mace_rl.results.records import read_episodes
 
@@ -144,7 +144,7 @@ def tabulate(folder: Path) -> None:
         environment, variant, seed = run
         path = TABLES / "runs" / environment / variant / f"seed{seed}" / files.EPISODES
         frames[run] = read_episodes(path, study.run_config(*run).episodes)
-    table = tables.table1(metrics_table(frames, list(frames), settings), settings)
+    table = summary.table1(metrics_table(frames, list(frames), settings), settings)
     folder.mkdir(parents=True)
     (folder / "table1.csv").write_text(table.to_csv(index=False), encoding="utf-8")
     fragment = latex.table1_latex(table, study.labels, settings)

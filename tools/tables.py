@@ -4,9 +4,10 @@
     python -m tools.tables --report STUDY   (make report)
 
 The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
-the outputs that reference/studies.yaml names. They are compared with those in reference/tables.
-New ones are kept there; with --check that one is missing is a mistake too. With --report only the
-page of one study is made, and not compared.
+the outputs that reference/studies.yaml names, and README.md: tables.md with the pictures that are
+among these. They are compared with those in reference/tables. New ones are kept there; with --check
+that one is missing is a mistake too. With --report only the page of one study is made, and not
+compared.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import gc
 import importlib
 import multiprocessing.connection
 import os
+import re
 import runpy
 import shutil
 import signal
@@ -39,17 +41,18 @@ SHARED = (
     *("gymnasium", "smart_open", "nbformat", "rich.live", "pandas", "seaborn", "fontTools.subset"),
     *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
     *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
-    *(f"mace_rl.results.{name}" for name in ("claims_text", "comparisons", "pictures", "readings")),
+    *(f"mace_rl.results.{name}" for name in ("comparisons", "pages", "pictures", "readings")),
 )
 fork = multiprocessing.get_context("fork")
 
 KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
-PAGE = "report.html"
+PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
+PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
-    *("metrics", "table1", "table2", "comparisons", "aggregate", "figure", "claims"),
-    *("picture", "forest", "readings", "page"),
+    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "forest"),
+    *("readings", "page"),
 )
 
 
@@ -133,6 +136,14 @@ def log_of(name: str) -> Path:
     return MADE / name / "snakemake.log"
 
 
+def write_readme(name: str, outputs: list[str]) -> None:
+    """README.md of a study, beside what is kept of it: its name, its tables, these pictures."""
+    text = (MADE / name / TABLES).read_text(encoding="utf-8")
+    text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
+    text = re.sub("^# .*", f"# {name}", text)
+    (MADE / name / README).write_text(text, encoding="utf-8")
+
+
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
     """The outputs that are not those in `EXPECTED`; new ones go there, unless `check`."""
     different = []
@@ -172,8 +183,13 @@ def main() -> None:
         make_all({only: {**studies[only], "outputs": [PAGE]}})
         print(MADE / only / PAGE)
         return
-    make_all(studies)
     outputs = {name: study["outputs"] for name, study in studies.items()}
+    make_all(
+        {name: {**study, "outputs": [*study["outputs"], TABLES]} for name, study in studies.items()}
+    )
+    for name in outputs:
+        write_readme(name, outputs[name])
+        outputs[name] = [*outputs[name], README]
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
     print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")

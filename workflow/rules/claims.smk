@@ -4,7 +4,7 @@
 rule claims:
     input:
         metrics=f"{RESULTS}/metrics.csv",
-        episodes=EPISODES,
+        betas=f"{RESULTS}/betas.csv",
         records=RECORDS,
     output:
         json=f"{RESULTS}/claims.json",

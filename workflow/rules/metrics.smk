@@ -6,7 +6,8 @@ rule metrics:
         episodes=EPISODES,
         records=RECORDS,
     output:
-        f"{RESULTS}/metrics.csv",
+        metrics=f"{RESULTS}/metrics.csv",
+        betas=f"{RESULTS}/betas.csv",
     log:
         f"{RESULTS}/logs/metrics.log",
     params:

@@ -4,20 +4,17 @@
 from mace_rl.sources import PACKAGE
 
 REPORTED = {
-    "metrics": f"{RESULTS}/metrics.csv",
-    "table1": f"{RESULTS}/table1.csv",
-    "supplement": f"{RESULTS}/supplement.csv",
-    "comparisons": f"{RESULTS}/comparisons.csv",
-    "aggregate": f"{RESULTS}/aggregate.csv",
-    "readings": f"{RESULTS}/readings.csv",
-    **{f"curves{number}": f"{RESULTS}/figure{number}.csv" for number in "12"},
-    **{f"seeds{number}": f"{RESULTS}/figure{number}_seeds.csv" for number in "12"},
+    **{
+        name: f"{RESULTS}/{name}.csv"
+        for name in (
+            *("metrics", "table1", "supplement", "comparisons", "aggregate"),
+            *("readings", "figure1", "figure1_seeds", "figure2", "figure2_seeds", *REGRET),
+        )
+    },
     "records": RECORDS,
     # To these the page refers.
     "in_print": [f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
 }
-if MEASURED.regret:
-    REPORTED["regret"] = f"{RESULTS}/regret.csv"
 if CLAIMS:
     REPORTED["claims"] = CLAIMS[0]
 
@@ -38,9 +35,7 @@ rule page:
         colours=study.colours,
         command=COMMAND,
         configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
-        given=GIVEN,
         ppo=ppo_settings(),
-        needs=lambda wildcards: what_needs_what(),
         template=provenance.file_digest(PACKAGE / "report" / "page.html"),
         code=code("report.py", MEASURED),
     script:

@@ -126,25 +126,3 @@ def code(script, settings=None):
     """
     named = settings.references() if settings else {}
     return digest_of(script, *(source_file(reference, key) for key, reference in named.items()))
-
-
-@cache
-def what_needs_what():
-    """For each rule the rules whose output it reads; asked for when all of them are known."""
-    steps = [step for step in workflow.rules if step.name != "all"]
-    # One file of each name will do: a thousand runs have a thousand files of the same kind.
-    read = {step.name: {os.path.basename(file): file for file in step.input} for step in steps}
-    return {
-        step.name: [
-            maker.name
-            for maker in steps
-            if any(makes(maker, str(file)) for file in read[step.name].values())
-        ]
-        for step in steps
-    }
-
-
-def makes(step, file):
-    """Whether `file`, which may have wildcards, is an output of the step."""
-    patterns = [re.sub(r"\{(\w+),[^{}]*\}", r"{\1}", str(output)) for output in step.output]
-    return file in patterns or step.is_producer(file)

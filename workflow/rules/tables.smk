@@ -1,52 +1,35 @@
-# The paper's tables, and whether their differences are more than chance.
+# The paper's tables, whether their differences are more than chance, and all of it on one page.
 
 
-rule table1:
+def supplementary(*names):
+    """These CSV files, with their captions in Snakemake's report."""
+    return {
+        name: report(
+            f"{RESULTS}/{name}.csv", caption=f"../report/{name}.rst", category="Supplement"
+        )
+        for name in names
+    }
+
+
+rule tables:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        table1=report(f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"),
-        table1_data=report(
-            f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"
+        **supplementary("supplement", "comparisons", "aggregate", *REGRET),
+        table1=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"),
+        table1_tex=report(
+            f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"
         ),
-        supplement=f"{RESULTS}/supplement.tex",
-        supplement_data=report(
-            f"{RESULTS}/supplement.csv", caption="../report/supplement.rst", category="Supplement"
-        ),
+        supplement_tex=f"{RESULTS}/supplement.tex",
     log:
-        f"{RESULTS}/logs/table1.log",
+        f"{RESULTS}/logs/tables.log",
     params:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
-        code=code("table1.py", MEASURED),
+        code=code("tables.py", MEASURED),
     script:
-        "../scripts/table1.py"
-
-
-rule comparisons:
-    input:
-        f"{RESULTS}/metrics.csv",
-    output:
-        **{
-            name: report(
-                f"{RESULTS}/{name}.csv", caption="../report/regret.rst", category="Supplement"
-            )
-            for name in REGRET
-        },
-        comparisons=report(
-            f"{RESULTS}/comparisons.csv",
-            caption="../report/comparisons.rst",
-            category="Supplement",
-        ),
-    log:
-        f"{RESULTS}/logs/comparisons.log",
-    params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
-        code=code("comparisons.py", MEASURED),
-    script:
-        "../scripts/comparisons.py"
+        "../scripts/tables.py"
 
 
 rule table2:
@@ -61,16 +44,24 @@ rule table2:
         "../scripts/table2.py"
 
 
-rule aggregate:
+TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate", *REGRET]
+TABULATED += ["readings"] if CLAIMS else []  # seconds of work that only Table 1 is worth
+
+
+# The pictures are no inputs: the page only names them.
+rule tables_page:
     input:
-        f"{RESULTS}/metrics.csv",
+        **{name: f"{RESULTS}/{name}.csv" for name in TABULATED},
+        **({"claims": CLAIMS[0]} if CLAIMS else {}),
     output:
-        report(f"{RESULTS}/aggregate.csv", caption="../report/aggregate.rst", category="Supplement"),
+        report(f"{RESULTS}/tables.md", caption="../report/tables.rst", category="Results"),
     log:
-        f"{RESULTS}/logs/aggregate.log",
+        f"{RESULTS}/logs/tables_page.log",
     params:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
-        code=code("aggregate.py", MEASURED),
+        pictures=["figure1", "figure2", *PICTURES, "readings"],
+        command=COMMAND,
+        code=code("tables_page.py", MEASURED),
     script:
-        "../scripts/aggregate.py"
+        "../scripts/tables_page.py"

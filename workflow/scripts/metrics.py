@@ -1,15 +1,16 @@
-"""metrics.csv: what is measured on each run."""
+"""metrics.csv and betas.csv: what is measured on each run."""
 
 from job import job
 
 with job("metrics", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.metrics_table import metrics_table
+    from mace_rl.results.metrics_table import betas_table, metrics_table
     from mace_rl.runs.finished import read_runs
 
-    params = snakemake.params
+    params, output = snakemake.params, snakemake.output
+    settings = MetricsConfig.model_validate(params.settings)
     runs = read_runs(snakemake.input.records, params.runs)
     wanted = [tuple(run[:3]) for run in params.runs]
-    table = metrics_table(runs, wanted, MetricsConfig.model_validate(params.settings))
-    write_atomically(snakemake.output[0], table.to_csv(index=False))
+    for path, table in ((output.metrics, metrics_table), (output.betas, betas_table)):
+        write_atomically(path, table(runs, wanted, settings).to_csv(index=False))

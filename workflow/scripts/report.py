@@ -5,28 +5,27 @@ from pathlib import Path
 from job import job
 
 with job("the report", snakemake.log[0]):
+    from mace_rl.config.agent import PPOConfig
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.report.animations import animations
-    from mace_rl.report.page import Making, page, read_tables
-    from mace_rl.report.workflow_graph import graph
+    from mace_rl.report.page import Making, page, read_data
     from mace_rl.runs.provenance import read_record
 
     params, records = snakemake.params, [Path(record) for record in snakemake.input.records]
     settings = MetricsConfig.model_validate(params.settings)
     runs = [tuple(run[:3]) for run in params.runs]
-    tables = read_tables(snakemake.input, runs, settings)
+    found = {name: path for name, path in snakemake.input.items() if isinstance(path, str)}
+    data, claims = read_data(found, runs, settings)
     first = {}  # of the seeds of an environment and variant
     for (env, variant, _), record in zip(runs, records, strict=True):
         first.setdefault((env, variant), record.parent)
     making = Making(
         command=params.command,
         configuration=params.configuration,
-        given=params.given,
-        hyperparameters=params.ppo,
-        workflow=graph("page", params.needs, {"train": f"{len(runs)} runs"}),
+        ppo={env: PPOConfig.model_validate(values) for env, values in params.ppo.items()},
         records=list(map(read_record, records)),
     )
     films = animations(first, params.labels, Path(snakemake.output[0]).parent)
-    html = page(tables, making, films, settings, params.labels, params.colours)
+    html = page(data, claims, making, films, settings, params.labels, params.colours)
     write_atomically(snakemake.output[0], html)

@@ -14,7 +14,7 @@ import pandas as pd
 import scipy
 
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import Metric, all_metrics, slope
+from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.paper import (
     ACROBOT,
     CARTPOLE,
@@ -33,8 +33,7 @@ from mace_rl.results.statistics import (
     stratified_comparison,
 )
 
-CORRELATION = "stagnation_correlation"  # of stagnation and the β that follows; over 0
-
+CORRELATION = "stagnation_correlation"  # of betas.csv; over 0
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
 WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
@@ -42,6 +41,7 @@ FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
 LITERAL, ROBUST = "by the paper's words and code", "robust"
+VERDICTS = ("reproduced", "contradicted", "inconclusive")
 
 
 class Part(NamedTuple):
@@ -152,18 +152,6 @@ class Finding:
     in_paper: float  # the same difference in the paper's Table 1; NaN where that has none
     p_holm: float = np.nan
     outcome: str = ""  # holds, fails or open
-
-
-def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
-    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
-
-    returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
-    2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
-    """
-    stagnation, following = -slope(returns, window)[:-1], betas[2 * window :]
-    if len(following) < 2 or np.ptp(stagnation) == 0 or np.ptp(following) == 0:
-        return 0.0
-    return float(scipy.stats.spearmanr(stagnation, following).statistic)
 
 
 def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]:

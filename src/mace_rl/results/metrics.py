@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy  # loads what is used of it when it is
 
 from mace_rl.config.plugins import load
 from mace_rl.config.results import MetricsConfig
@@ -121,6 +122,18 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
     """
     total = _moving_sum(returns, window)
     return (total[window:] - total[:-window]) / window**2
+
+
+def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
+    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
+
+    returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
+    2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
+    """
+    stagnation, following = -slope(returns, window)[:-1], betas[2 * window :]
+    if len(following) < 2 or np.ptp(stagnation) == 0 or np.ptp(following) == 0:
+        return 0.0
+    return float(scipy.stats.spearmanr(stagnation, following).statistic)
 
 
 def sample_efficiency(curve: LearningCurve) -> Episode:

@@ -18,8 +18,12 @@ from mace_rl.results.metrics import (
     all_metrics,
     final_return,
     metrics_columns,
+    stagnation_correlation,
 )
 from mace_rl.results.records import RecordError, RunKey, read_table
+
+BETAS = {"env": str, "variant": str, "seed": int}  # the columns of betas.csv
+BETAS |= dict.fromkeys(("beta_end", "beta_lowest", "beta_highest", "stagnation_correlation"), float)
 
 
 def metrics_of_run(
@@ -61,6 +65,22 @@ def metrics_table(
     _check_attained("the table of metrics", table, all_metrics(settings))
     _check_budgets("the records", table)
     return table
+
+
+def betas_table(
+    runs: Mapping[RunKey, pd.DataFrame], wanted: Sequence[RunKey], settings: MetricsConfig
+) -> pd.DataFrame:
+    """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation.
+
+    The end is that of `final_return`; the last column is what `stagnation_correlation` says.
+    """
+    rows = []
+    for run in wanted:
+        returns, beta = (runs[run][name].to_numpy() for name in ("extrinsic_return", "beta"))
+        end = final_return(beta, settings.final_fraction)
+        correlation = stagnation_correlation(returns, beta, settings.moving_average)
+        rows.append([*run, end, beta.min(), beta.max(), correlation])
+    return pd.DataFrame(rows, columns=list(BETAS))
 
 
 def read_metrics(

@@ -5,7 +5,7 @@ there is first by chance and by how returns are distributed, since nothing is le
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +17,8 @@ from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
 from mace_rl.results.records import RunKey
-from mace_rl.results.statistics import logrank, mean_interval
+from mace_rl.results.statistics import logrank
+from mace_rl.results.summary import summary
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"
 # The paper's words, and the rule of its public code: what is worth asking of noise too.
 ASKED_OF_NOISE = ("sample_efficiency", "convergence_steps_public_code")
+COLUMNS = ["env", "kind", "reading", "source", "variant", "mean", "low", "high", "seeds"]
+COLUMNS += ["censored", "rank", "p_value"]  # of readings.csv
 LEVEL = 0.05  # of the log-rank test that the first is really ahead
 
 
@@ -55,101 +58,63 @@ def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> 
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
     """
-    wanted = list(frames)
-    sources = {RUNS: metrics_table(frames, wanted, settings)}
-    sources[SHUFFLED] = metrics_table(shuffled(frames, settings), wanted, settings)
-    rows = []
+    wanted, found = list(frames), kinds(settings)
+    runs = {RUNS: metrics_table(frames, wanted, settings)}
+    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), wanted, settings)
+    means = {
+        source: summary(table, [metric for _, metric in found], settings)
+        for source, table in runs.items()
+    }
+    parts = []
     for environment in dict.fromkeys(name for name, _, _ in wanted):
-        variants = list(dict.fromkeys(v for e, v, _ in wanted if e == environment))
-        for place, kind in enumerate(PAPER_METRICS):
-            published = {
-                name: PAPER_TABLE1[environment, name][place]
-                for name in variants
-                if (environment, name) in PAPER_TABLE1
-            }
-            rows += _published(environment, kind, published)
-        for (kind, metric), source in itertools.product(kinds(settings), (RUNS, SHUFFLED)):
+        parts += [_published(environment, kind, wanted) for kind in PAPER_METRICS]
+        for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
             if source == RUNS or metric.name in ASKED_OF_NOISE:
-                table = sources[source]
-                own = table[table["env"] == environment]
-                rows += _measured(environment, kind, metric, source, own, settings)
-    return pd.DataFrame(rows)
+                table, own = means[source], runs[source]
+                rows = table[(table["env"] == environment) & (table["metric"] == metric.name)]
+                own = own[own["env"] == environment]
+                parts.append(
+                    _measured(rows, own, metric, settings).assign(kind=kind, source=source)
+                )
+    table = pd.concat(parts).rename(columns={"metric": "reading"})
+    return table[COLUMNS].reset_index(drop=True)
 
 
-def _published(environment: str, kind: str, values: Mapping[str, int]) -> list[dict[str, object]]:
-    ranks = _ranks(values)
-    return [
-        {
-            "env": environment,
-            "kind": kind,
-            "reading": kind,
-            "source": PAPER,
-            "variant": name,
-            "mean": float(value),
-            "low": np.nan,
-            "high": np.nan,
-            "seeds": 0,
-            "censored": 0,
-            "rank": ranks[name],
-            "p_value": np.nan,
-        }
-        for name, value in values.items()
-    ]
+def _published(environment: str, kind: str, runs: Sequence[RunKey]) -> pd.DataFrame:
+    """The numbers of the paper's Table 1, of the variants that are there."""
+    values = {
+        name: float(PAPER_TABLE1[environment, name][PAPER_METRICS.index(kind)])
+        for name in dict.fromkeys(variant for _, variant, _ in runs)
+        if (environment, name) in PAPER_TABLE1
+    }
+    rows = pd.DataFrame({"variant": list(values), "mean": list(values.values())})
+    rows = rows.assign(env=environment, kind=kind, metric=kind, source=PAPER, low=np.nan)
+    rows = rows.assign(high=np.nan, seeds=0, censored=0, p_value=np.nan)
+    return rows.assign(rank=rows["mean"].rank(method="min").astype(int))
 
 
 def _measured(
-    environment: str,
-    kind: str,
-    metric: Metric,
-    source: str,
-    runs: pd.DataFrame,
-    settings: MetricsConfig,
-) -> list[dict[str, object]]:
-    """The rows of one reading of one environment's runs."""
-    groups = {str(name): group for name, group in runs.groupby("variant", sort=False)}
-    ranks = _ranks({name: group[metric.name].mean() for name, group in groups.items()})
-    first = min(ranks, key=ranks.__getitem__)
+    rows: pd.DataFrame, runs: pd.DataFrame, metric: Metric, settings: MetricsConfig
+) -> pd.DataFrame:
+    """The rows of one reading in a `summary`, with the rank and the test of each variant."""
+    variants = rows["variant"].to_list()
+    first = variants[int(rows["mean"].argmin())]
     reached = {
-        name: np.where(group[metric.flag] == 1, np.inf, group[metric.name])
-        for name, group in groups.items()
+        str(name): np.where(own[metric.flag] == 1, np.inf, own[metric.name])
+        for name, own in runs.groupby("variant")
     }
-    rows = []
-    for name, group in groups.items():
-        low, high = mean_interval(
-            group[metric.name].to_numpy(np.float64),
-            settings.confidence,
+    p_values = [
+        np.nan
+        if name == first
+        else logrank(
+            reached[first],
+            reached[name],
             settings.bootstrap_repetitions,
             np.random.default_rng(settings.bootstrap_seed),
         )
-        p_value = np.nan
-        if name != first:
-            generator = np.random.default_rng(settings.bootstrap_seed)
-            p_value = logrank(
-                reached[first], reached[name], settings.bootstrap_repetitions, generator
-            )
-        rows.append(
-            {
-                "env": environment,
-                "kind": kind,
-                "reading": metric.name,
-                "source": source,
-                "variant": name,
-                "mean": group[metric.name].mean(),
-                "low": float(np.clip(low, 1, group["episodes"].iloc[0])),
-                "high": float(np.clip(high, 1, group["episodes"].iloc[0])),
-                "seeds": len(group),
-                "censored": int(group[metric.flag].sum()),
-                "rank": ranks[name],
-                "p_value": p_value,
-            }
-        )
-    return rows
-
-
-def _ranks(values: Mapping[str, float]) -> dict[str, int]:
-    """1 for the lowest; equal ones share the better rank."""
-    ordered = sorted(values.values())
-    return {name: 1 + ordered.index(value) for name, value in values.items()}
+        for name in variants
+    ]
+    return rows.assign(rank=rows["mean"].rank(method="min").astype(int), p_value=p_values)
 
 
 def title(kind: str, reading: str, source: str, settings: MetricsConfig) -> str:
@@ -160,24 +125,6 @@ def title(kind: str, reading: str, source: str, settings: MetricsConfig) -> str:
     if source == SHUFFLED:
         return f"{names[reading]}, returns shuffled"
     return names[reading]
-
-
-def markdown(table: pd.DataFrame, settings: MetricsConfig) -> str:
-    """The small table: of each reading and environment the variants, the first one first.
-
-    table: that of `readings`. Bold is a first place that the log-rank test against each of the
-    others does not put down to chance (p < 0.05, not corrected for the many readings); † means that
-    some of the runs never got there.
-    """
-    environments = list(table["env"].unique())
-    lines = [
-        f"| episodes | {' | '.join(environments)} |",
-        "|---" * (1 + len(environments)) + "|",
-    ]
-    for (kind, reading, source), rows in in_order(table):
-        cells = [_ranking(rows[rows["env"] == name]) for name in environments]
-        lines.append(f"| {title(kind, reading, source, settings)} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
 
 
 def in_order(
@@ -192,20 +139,6 @@ def in_order(
     ]
     sources = PAPER, RUNS, SHUFFLED
     return sorted(found, key=lambda one: (PAPER_METRICS.index(one[0][0]), sources.index(one[0][2])))
-
-
-def _ranking(rows: pd.DataFrame) -> str:
-    """The variants in the order of their means."""
-    if rows.empty:
-        return ""
-    ordered, is_first = ranked(rows)
-    cells = [
-        f"{row.variant} {float(str(row.mean)):.0f}{'†' if row.censored else ''}"
-        for row in ordered.itertuples(index=False)
-    ]
-    if is_first:
-        cells[0] = f"**{cells[0]}**"
-    return ", ".join(cells)
 
 
 def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:

@@ -1,94 +1,356 @@
-"""The paper's Table 1 and its supplement as data: each metric averaged over seeds."""
+"""Every table of a study: the data of table1.csv and supplement.csv, and frames of cells.
 
-import math
-from collections.abc import Sequence
+A frame of cells has a table's heads as columns and what is printed as values: words (`str`) and
+`Cell`s. `renderings` makes Markdown, HTML and LaTeX of it. Variants are called what they are called
+in the data: `named` gives them other names first.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
+from mace_rl.results.claims import LITERAL, ROBUST
+from mace_rl.results.metrics import all_metrics
+from mace_rl.results.paper import PAPER_METRICS
+from mace_rl.results.readings import in_order, ranked, title
+from mace_rl.results.renderings import Cell, Value, estimate, number
 from mace_rl.results.statistics import mean_interval
+from mace_rl.results.summary import digits_by_metric
 
-DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
+POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
+SOLVED = 0.9  # of the last episodes, for a seed to count
+
+PAPER_SETTINGS = {  # Paper, Table 2, in its order; the optimiser, Adam, is the last
+    "actor_learning_rate": "Actor Learning Rate",
+    "critic_learning_rate": "Critic Learning Rate",
+    "discount": "Discount Factor (\u03b3)",
+    "epochs": "PPO Epochs (\U0001d43e)",
+    "clip": "PPO Clip Parameter (ε)",
+}
+OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is named after its key
+    "gae_lambda": "GAE Parameter (λ)",
+    "rollout_steps": "Steps per Update, at least (whole episodes)",
+    "minibatch_size": "Minibatch Size (steps)",
+    "network": "Network of Actor and of Critic",
+    "hidden_units": "Hidden Units of Actor and of Critic",
+    "initial_log_std": "Initial Log Standard Deviation (continuous actions)",
+    "max_gradient_norm": "Maximal Gradient Norm",
+    "normalise_observations": "Normalised Observations",
+    "entropy_coefficient": "Entropy Coefficient",
+    "critic": "Critic",
+    "scale_rewards": "Rewards over the Deviation of their Discounted Sums",
+    "scale_advantages": "Advantages over their Root Mean Square, by Kind of Reward",
+    "smallest_advantage": "Smallest Scale of Extrinsic Advantages",
+    "centre_advantages": "Centred Advantages",
+}
 
 
-def summary(
-    table: pd.DataFrame, metrics: Sequence[Metric], settings: MetricsConfig
-) -> pd.DataFrame:
-    """The `metrics` averaged over seeds; `table` is the frame of metrics.csv.
+def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
+    """A study's data with other names of its variants."""
+    columns = table.columns.intersection(["variant", "baseline", "best_constant"])
+    return table.assign(**{column: table[column].replace(dict(names)) for column in columns})
 
-    One row per environment, variant and metric, in the order of `table` and `metrics`: `mean`,
-    the bounds `low` and `high` of its interval (NaN with one seed; cut to where its mean must lie,
-    [1, E] for a metric in episodes and [0, 1] for a share), the number of `seeds`, how many of them
-    are `censored` (counted with E, so the mean is a lower bound), the budget E in `episodes`, and
-    the `paper`'s value (missing where it has none).
+
+def table1(table: pd.DataFrame) -> pd.DataFrame:
+    """Table 1 in the paper's layout, of `summary.table1`: sample efficiency / convergence steps.
+
+    Rows are variants, columns environments. The lowest mean of each environment and metric is the
+    best, as displayed; ties all are, and a mean of seeds that all never got there is not. The
+    paper's numbers stand beside.
     """
+    best = {
+        key: number(group["mean"].min())
+        for key, group in table[table["censored"] < table["seeds"]].groupby(["env", "metric"])
+    }
+
+    def cell(runs: pd.DataFrame) -> Cell:
+        rows = [runs[runs["metric"] == metric].iloc[0] for metric in PAPER_METRICS]
+        means = [
+            _mean(row, 0, row["censored"] < row["seeds"] and number(row["mean"]) == best[key])
+            for row, key in ((row, (row["env"], row["metric"])) for row in rows)
+        ]
+        published = " / ".join(number(row["paper"]) for row in rows if not pd.isna(row["paper"]))
+        return Cell(means, note=f"paper: {published}" if published else "")
+
+    return _grid(table, cell, "Algorithm")
+
+
+def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.DataFrame]:
+    """By environment, a row for each metric of a `summary` and a column for each variant."""
+    digits = digits_by_metric(table, settings)
+    labelled = table.assign(label=table["metric"].map(_labels(settings)))
+    return {
+        str(environment): _grid(
+            own,
+            lambda rows: Cell(
+                [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
+            ),
+            rows="label",
+            columns="variant",
+        )
+        for environment, own in labelled.groupby("env", sort=False)
+    }
+
+
+def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
+    """One metric of a `summary`, a row for each variant and a column for each environment."""
+    digits, own = digits_by_metric(table, settings), table[table["metric"] == metric]
+    return _grid(own, lambda rows: Cell([_mean(rows.iloc[0], digits[rows["env"].iloc[0], metric])]))
+
+
+def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The final return of each variant's worst seed, from the frame of metrics.csv."""
+    returns = runs.assign(metric="final_return", mean=runs["final_return"])
+    digits = digits_by_metric(returns, settings)
+    return _grid(
+        returns, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0], "final_return"])
+    )
+
+
+def solved(runs: pd.DataFrame) -> pd.DataFrame:
+    """How many seeds solve each task, from the frame of metrics.csv."""
+    return _grid(runs, lambda own: f"{int((own['solved'] >= SOLVED).sum())} of {len(own)}")
+
+
+def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
+    digits, labels = digits_by_metric(means, settings), _labels(settings)
+    return _rows(
+        table,
+        {
+            "environment": lambda row: row["env"],
+            "metric": lambda row: labels[row["metric"]],
+            "": lambda row: f"{row['variant']} over {row['baseline']}",
+            "n": lambda row: _number(row["seeds"]),
+            # All environments together have no digits, and no values that would need them.
+            "difference": lambda row: _estimate(
+                row, "difference", digits.get((row["env"], row["metric"]), 0), ends=""
+            ),
+            "p": lambda row: _number(row["p_value"], 4),
+            "p (Holm)": lambda row: _number(row["p_holm"], 4),
+            "P": lambda row: _estimate(row, "probability", 2),
+        },
+    )
+
+
+def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """The probabilities of comparisons.csv: a row for each pair, a column for each environment."""
+    own = table.assign(pair=table["variant"] + " over " + table["baseline"])
+    own = own[own["metric"] == metric]
+    return _grid(own, lambda rows: _estimate(rows.iloc[0], "probability", 2), rows="pair")
+
+
+def aggregate(table: pd.DataFrame) -> pd.DataFrame:
+    """aggregate.csv."""
+    return _rows(
+        table,
+        {
+            "": lambda row: row["variant"],
+            "score of": lambda row: row["metric"].replace("_", " "),
+            "runs": lambda row: _number(row["runs"]),
+            "mean": lambda row: _estimate(row, "mean", 3),
+            "interquartile mean": lambda row: _estimate(row, "iqm", 3),
+        },
+    )
+
+
+def regret(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """regret.csv, with the digits that the same returns have in `means`, a `summary`."""
+    found = digits_by_metric(means, settings)
+
+    def digits(row: pd.Series) -> int:
+        return found.get((row["env"], "area_under_curve"), 0)
+
+    return _rows(
+        table.fillna({"best_constant": ""}),
+        {
+            "environment": lambda row: row["env"],
+            "best constant": lambda row: row["best_constant"],
+            "its return": lambda row: _number(row["best_area"], digits(row)),
+            table["variant"].iloc[0]: lambda row: _number(row["variant_area"], digits(row)),
+            "regret": lambda row: _estimate(row, "regret", 4, ends=""),
+            "n": lambda row: _number(row["seeds"]),
+        },
+    )
+
+
+def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """Of each reading (`readings.csv`) and environment the variants, the first one first.
+
+    The best is a first place that the log-rank test against each of the others does not put down to
+    chance (p < 0.05, not corrected for the many readings); † means that some of the runs never got
+    there.
+    """
+
+    def cell(rows: pd.DataFrame) -> Cell:
+        ordered, is_first = ranked(rows)
+        values = [
+            Value(f"{row['variant']} {number(row['mean'])}", mark="†" if row["censored"] else "")
+            for _, row in ordered.iterrows()
+        ]
+        return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
+
+    parts = [own.assign(title=title(*key, settings)) for key, own in in_order(table)]
+    frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
+    return frame[["episodes", *table["env"].unique()]]
+
+
+def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """betas.csv: the variants whose β is not the same in every seed, and how it ended in each."""
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
-        published = PAPER_TABLE1.get((str(environment), str(variant)), ())
-        paper = dict(zip(PAPER_METRICS, published, strict=False))  # empty if it has none
-        for metric in metrics:
-            values = runs[metric.name].to_numpy(np.float64)  # [seeds]
-            low, high = mean_interval(  # a generator of its own: no cell depends on another
-                values,
-                settings.confidence,
-                settings.bootstrap_repetitions,
-                np.random.default_rng(settings.bootstrap_seed),
-            )
-            limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
-            low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
+        if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
+            continue
+        found = runs["stagnation_correlation"].to_numpy()
+        low, high = mean_interval(
+            found,
+            settings.confidence,
+            settings.bootstrap_repetitions,
+            np.random.default_rng(settings.bootstrap_seed),
+        )
+        seeds = (
+            ", ".join(number(beta, 2) for beta in sorted(runs[name]))
+            for name in ("beta_end", "beta_lowest")
+        )
+        correlation = Cell([estimate(found.mean(), float(low), float(high), 3)])
+        rows.append([environment, variant, _number(len(runs)), *seeds, correlation])
+    heads = ["environment", "", "n", "β at the end, by seed", "lowest", "with stagnation"]
+    return pd.DataFrame(rows, columns=heads)
+
+
+def verdicts(claims: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """The claim ledger: a verdict for each claim, in both ways to measure."""
+    rows = [
+        [
+            claim["claim"],
+            claim["statement"],
+            *(Cell([Value(claim[how]["verdict"], best=True)]) for how in (LITERAL, ROBUST)),
+            claim["paper"],
+        ]
+        for claim in claims
+    ]
+    return pd.DataFrame(rows, columns=["", "claim", LITERAL, ROBUST, "the paper's Table 1"])
+
+
+def parts(claims: Sequence[Mapping[str, Any]], how: str, names: Mapping[str, str]) -> pd.DataFrame:
+    """Every part of the claims, measured in one of the two ways, with these `names`, if any."""
+    rows = []
+    for claim in claims:
+        for part in claim[how]["parts"]:
+            digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+            pair = (names.get(name, name) for name in (part["variant"], part["baseline"] or "0"))
+            margins = ("in_paper", "worth_mentioning", "detectable")
             rows.append(
-                {
-                    "env": environment,
-                    "variant": variant,
-                    "metric": metric.name,
-                    "mean": values.mean(),
-                    "low": float(low),
-                    "high": float(high),
-                    "seeds": len(values),
-                    "censored": int(runs[metric.flag].sum()) if metric.flag in runs else 0,
-                    "episodes": int(runs["episodes"].iloc[0]),
-                    "paper": paper.get(metric.name),
-                }
+                [
+                    claim["claim"],
+                    "all" if len(part["environments"]) > 1 else part["environments"][0],
+                    names.get(part["metric"], part["metric"]),
+                    " over ".join(pair),
+                    _number(part["seeds"]),
+                    _estimate(part, "difference", digits, ends=""),
+                    _number(part["p_holm"], 3),
+                    _estimate(part, "probability", 2),
+                    *(_number(part[name], digits) for name in margins),
+                    part["outcome"],
+                ]
             )
-    return pd.DataFrame(rows).astype({"paper": "Int64"})
+    heads = ["", "environment", "metric", "over", "n", "difference", "p (Holm)", "P", "paper"]
+    return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
 
 
-def table1(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """The data of table1.csv: `summary` of the paper's two metrics."""
-    papers = [metric for metric in all_metrics(settings) if metric.name in PAPER_METRICS]
-    return summary(table, papers, settings)
+def table2(ppo: Mapping[str, PPOConfig]) -> pd.DataFrame:
+    """The PPO hyperparameters, from the resolved settings of each environment.
 
-
-def supplement(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """`summary` of the other metrics."""
-    return summary(table, companions(settings), settings)
-
-
-def companions(settings: MetricsConfig) -> list[Metric]:
-    """All metrics but the two of Table 1."""
-    return [metric for metric in all_metrics(settings) if metric.name not in PAPER_METRICS]
-
-
-def digits_by_metric(table: pd.DataFrame, settings: MetricsConfig) -> dict[tuple[str, str], int]:
-    """How many digits after the point a `summary` is shown with, by environment and metric.
-
-    Of returns as many as give the largest mean three digits: some environments' are all below 1.
+    The paper's six rows, then this project's further settings. A value that is not the same in all
+    environments is shown for each.
     """
-    units = {metric.name: metric.unit for metric in all_metrics(settings)}
-    found = {}
-    for (environment, metric), rows in table.groupby(["env", "metric"], sort=False):
-        unit, largest = units[str(metric)], rows["mean"].abs().max()
-        digits = DIGITS[unit]
-        if unit == "return" and largest > 0:
-            digits = max(digits, 2 - math.floor(math.log10(largest)))
-        found[str(environment), str(metric)] = digits
-    return found
+    own = [name for name in PPOConfig.model_fields if name not in PAPER_SETTINGS]
+    rows: list[list[str | Cell]]
+    rows = [[label, _setting(ppo, name)] for name, label in PAPER_SETTINGS.items()]
+    rows.append(["Optimizer", "Adam"])
+    rows += [
+        [OWN_SETTINGS.get(name, name.replace("_", " ").title()), _setting(ppo, name)]
+        for name in own
+    ]
+    return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
 
 
-def from_to(counts: pd.Series) -> str:
-    """A number, or from which to which."""
-    low, high = counts.min(), counts.max()
-    return str(low) if low == high else f"{low} to {high}"
+def _grid(
+    table: pd.DataFrame,
+    cell: Callable[[pd.DataFrame], str | Cell],
+    head: str = "",
+    rows: str = "variant",
+    columns: str = "env",
+) -> pd.DataFrame:
+    """A row for each of `rows` and a column for each of `columns`; empty where there is nothing."""
+    groups = dict(list(table.groupby([rows, columns], sort=False)))
+    across = list(table[columns].unique())
+    lines = [
+        [name, *(cell(groups[name, other]) if (name, other) in groups else "" for other in across)]
+        for name in table[rows].unique()
+    ]
+    return pd.DataFrame(lines, columns=[head, *across])
+
+
+def _rows(
+    table: pd.DataFrame, columns: Mapping[str, Callable[[pd.Series], str | Cell]]
+) -> pd.DataFrame:
+    """A row for each of the table's, what is printed in each column by its head."""
+    lines = [[cell(row) for cell in columns.values()] for _, row in table.iterrows()]
+    return pd.DataFrame(lines, columns=list(columns))
+
+
+def _labels(settings: MetricsConfig) -> dict[str, str]:
+    return {metric.name: metric.label for metric in all_metrics(settings)}
+
+
+def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:
+    """A row of a `summary`, with the number of seeds that never got there."""
+    mark = f"†{row['censored']}" if row["censored"] else ""
+    return estimate(row["mean"], row["low"], row["high"], digits, mark, best)
+
+
+def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell:
+    """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
+    prefix = f"{name}_" if ends is None else ends
+    return Cell([estimate(row[name], row[f"{prefix}low"], row[f"{prefix}high"], digits)])
+
+
+def _number(value: float | None, digits: int = 0) -> Cell:
+    return Cell([Value(number(value, digits))])
+
+
+def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
+    """The value of one setting, for each group of environments that share it."""
+    environments: dict[str, list[str]] = {}
+    for environment, config in ppo.items():
+        environments.setdefault(_value(getattr(config, name)), []).append(environment)
+    if len(environments) == 1:
+        return next(iter(environments))
+    values = [Value(f"{value} ({', '.join(whose)})") for value, whose in environments.items()]
+    return Cell(values, joint="; ")
+
+
+def _value(value: Any) -> str:
+    """A setting as it is printed."""
+    match value:
+        case None:
+            return "all steps of the update"
+        case bool():
+            return "yes" if value else "no"
+        case list():
+            return ", ".join(map(_value, value))
+        case CompiledNetwork():
+            return "tanh network"
+        case TorchModule():
+            return value.module
+        case float() if "e" in repr(value):
+            mantissa, exponent = repr(value).split("e")
+            power = str(int(exponent)).translate(str.maketrans("-0123456789", POWERS))
+            return f"{mantissa} \u00d7 10{power}"
+        case _:
+            return str(value)

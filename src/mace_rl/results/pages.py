@@ -1,0 +1,152 @@
+"""Pages of Markdown: claims.md, the ledger, and tables.md, every table of a study."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from mace_rl.config.results import MetricsConfig
+from mace_rl.results import tables
+from mace_rl.results.claims import LITERAL, POWER, ROBUST, VERDICTS
+from mace_rl.results.comparisons import ALL
+from mace_rl.results.renderings import markdown
+from mace_rl.results.summary import from_to
+
+RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
+
+
+def claims_page(claims: Sequence[Mapping[str, Any]], origin: str) -> str:
+    """claims.md, from the records of `claims.ledger`; `origin` says how it was made."""
+    intro = f"# Does it hold?\n\n{origin} The rule of the verdicts: docs/method.md.\n\n"
+    return intro + markdown(tables.verdicts(claims)) + "".join(_parts(claims))
+
+
+def _parts(claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    for how in (LITERAL, ROBUST):
+        yield (
+            f"\n## Part by part: {how}\n\n"
+            "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
+            " *P*: that a run of the first is better. *Margin*: what counts as an advantage worth"
+            f" mentioning. *Detectable*: the smallest that these seeds show with a power of"
+            f" {POWER:.0%}, before correction.\n\n"
+        )
+        yield markdown(tables.parts(claims, how, {}))
+
+
+def counted(claims: Sequence[Mapping[str, Any]], how: str) -> str:
+    """How many claims have which verdict, in words."""
+    counts = Counter(claim[how]["verdict"] for claim in claims)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+
+
+def tables_page(
+    data: Mapping[str, pd.DataFrame],
+    claims: Sequence[Mapping[str, Any]] | None,
+    pictures: Sequence[str],
+    settings: MetricsConfig,
+    origin: str,
+) -> str:
+    """tables.md: a study's pictures (PNG files beside it) and tables.
+
+    data: frames by the name of their CSV file: metrics, betas, table1, supplement, comparisons,
+    aggregate and, where the study has them, readings and regret. claims: the records of its ledger.
+    """
+    return "".join(
+        [
+            f"# The tables of this study\n\n{origin}\n",
+            *(f"\n![{name}]({name}.png)\n" for name in pictures),
+            *(_ledger(claims) if claims else ()),
+            *_means(data, settings),
+            *_compared(data, settings),
+            *_others(data, settings),
+            *_companions(data, settings),
+        ]
+    )
+
+
+def _section(title: str, note: str, frame: pd.DataFrame) -> str:
+    lines = f"\n{note}\n" if note else ""
+    return f"\n## {title}\n{lines}\n{markdown(frame)}"
+
+
+def _ledger(claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    verdicts = "; ".join(f"{how}: {counted(claims, how)}" for how in (LITERAL, ROBUST))
+    note = f"Of the paper's {len(claims)} claims, {verdicts}. The rule: docs/method.md."
+    yield _section("Does it hold?", note, tables.verdicts(claims))
+    yield from _parts(claims)
+
+
+def _means(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+    """What each variant reached in each environment."""
+    runs, table1, supplement = data["metrics"], data["table1"], data["supplement"]
+    interval = f"{100 * settings.confidence:g} % interval"
+    for metric, title in RETURNS.items():
+        frame = tables.means(supplement, metric, settings)
+        yield _section(title, f"Mean over {_seeds(runs)} seeds ({interval}).", frame)
+    frame = tables.worst(runs, settings)
+    yield _section("Final return of the worst seed", "", frame)
+    if "solved" in runs:
+        note = f"Seeds whose last episodes are solved in {tables.SOLVED:.0%} of the cases or more."
+        yield _section("Seeds that solve", note, tables.solved(runs))
+    note = (
+        "Sample efficiency / convergence steps in episodes, lower is better: mean over seeds"
+        f" ({interval}), the lowest bold. †k: k of the seeds never got there and count with the"
+        " whole budget, so the mean is a lower bound."
+    )
+    yield _section("Table 1", note, tables.table1(table1))
+
+
+def _seeds(runs: pd.DataFrame) -> str:
+    return from_to(runs.groupby(["env", "variant"]).size())
+
+
+def _compared(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+    """One variant against another."""
+    table = data["comparisons"]
+    for metric, title in RETURNS.items() if len(table) else ():
+        note = "P: that a run of the first is better than one of the second; 0.5 is a coin's toss."
+        yield _section(f"{title}: who is better", note, tables.improvement(table, metric))
+        note = (
+            "Difference: mean over the seeds that both have (interval). p: of the sign-flip test,"
+            " by itself and corrected for all metrics, pairs and environments (comparisons.csv)."
+        )
+        own = table[(table["metric"] == metric) & (table["env"] != ALL)]
+        frame = tables.comparisons(own, data["supplement"], settings)
+        yield _section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
+
+
+def _others(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+    """Regret, all environments together, readings and β."""
+    if "regret" in data:
+        frame = tables.regret(data["regret"], data["supplement"], settings)
+        note = (
+            "Returns: means of all training. Regret: the difference as a share of what the best"
+            " constant gains over random actions."
+        )
+        yield _section("What is lost against the best constant", note, frame)
+    if data["metrics"]["env"].nunique() > 1:
+        note = "Scores: 0 is the random policy, 1 the study's best run."
+        frame = tables.aggregate(data["aggregate"])
+        yield _section("All environments together", note, frame)
+    if "readings" in data:
+        note = (
+            "Means in episodes, the lowest first; bold if a log-rank test against each of the"
+            " others has p < 0.05, not corrected. †: some runs never got there."
+        )
+        frame = tables.readings(data["readings"], settings)
+        yield _section("What decides the ranking", note, frame)
+    frame = tables.betas(data["betas"], settings)
+    if len(frame):
+        note = (
+            "Where β is not the same in every seed. With stagnation: mean over seeds of its rank"
+            " correlation with the stagnation before (C9)."
+        )
+        yield _section("β", note, frame)
+
+
+def _companions(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+    """Every metric but Table 1's, environment by environment."""
+    note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
+    for environment, frame in tables.companions(data["supplement"], settings).items():
+        yield _section(f"The other metrics: {environment}", note, frame)
