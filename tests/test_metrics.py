@@ -1,9 +1,6 @@
 """Metrics on curves whose answers are known by hand, and against plain loops."""
 
-import importlib.util
-import re
 from decimal import ROUND_CEILING, Decimal
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,8 +8,6 @@ import pytest
 from invented import CONFIG, noisy
 
 from mace_rl.results import metrics as m
-
-ROOT = Path(__file__).parents[1]
 
 
 def ramp(flat_before, rise, flat_after):
@@ -269,23 +264,3 @@ def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
     np.testing.assert_allclose(
         m.moving_average(noisy(0), 25), pd.Series(noisy(0)).rolling(25).mean().dropna()
     )
-
-
-def test_the_reading_of_table_1_is_steady_and_sees_a_delay(monkeypatch):
-    """What docs/metrics.md chooses it by, with fewer curves."""
-    path = ROOT / "tools" / "convergence_simulation.py"
-    spec = importlib.util.spec_from_file_location("convergence_simulation", path)
-    spec.loader.exec_module(tool := importlib.util.module_from_spec(spec))
-    monkeypatch.setattr(tool, "REPEATS", 30)
-    named = {reading: name for name, reading in tool.READINGS.items()}
-    for shape in tool.SHAPES:
-        cells = dict(zip(tool.READINGS, tool.column(shape), strict=True))
-        spread, order = (
-            {name: float(re.split("±|,", cell)[part]) for name, cell in cells.items()}
-            for part in (1, 2)
-        )
-        chosen = named[m.convergence_steps]
-        assert spread[chosen] < 3.5 and order[chosen] > 98
-        assert order[named[m.convergence_steps_public_code]] < 60 or shape == "two steps"
-        if shape in ("CartPole", "Hopper"):  # late collapses, drift
-            assert spread[named[m.convergence_steps_steepest]] > 4 * spread[chosen]

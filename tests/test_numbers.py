@@ -11,14 +11,7 @@ from invented import table_for_claims
 
 from mace_rl.config.study import Study
 from mace_rl.results import claims, claims_text
-from tools import (
-    bonus_share,
-    convergence_simulation,
-    interval_coverage,
-    kept_runs,
-    meta_signal,
-    printed_numbers,
-)
+from tools import kept_runs, printed_numbers
 from tools.shown import results, runs
 
 ROOT = Path(__file__).parents[1]
@@ -66,20 +59,6 @@ def test_the_study_page_has_no_decimal_or_count_of_its_own() -> None:
     text = printed_numbers.MARKED.sub("", (ROOT / "docs/study.md").read_text(encoding="utf-8"))
     own = re.findall(r"(?<![\w.])[−-]?\d+\.\d+|\d+ of \d+", text)
     assert set(own) <= {"0.5", "0.05"}, "of a probability and of a test"
-
-
-@pytest.mark.slow
-def test_the_metrics_page_says_what_the_simulations_print(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    page = (ROOT / "docs/metrics.md").read_text(encoding="utf-8")
-    interval_coverage.main(2000)
-    assert "\n\n" + capsys.readouterr().out + "\n" in page
-    monkeypatch.setattr("sys.argv", ["convergence_simulation"])
-    convergence_simulation.main()
-    rows = [line.removesuffix("|") for line in capsys.readouterr().out.splitlines()[2:]]
-    shown = [line for line in page.splitlines() if line.startswith(tuple(rows))]
-    assert len(rows) == len(shown) > 10, "the page has columns of real runs beside them"
 
 
 def write(frame: pd.DataFrame, folder: Path) -> Path:
@@ -172,30 +151,6 @@ def test_finals_name_the_worst_seed(tmp_path: Path) -> None:
     assert line == "| ppo | 3 [1] / 6 |"
 
 
-def test_the_share_of_the_bonus_in_the_first_and_the_last_tenth(tmp_path: Path) -> None:
-    file, heads = tmp_path / "bonus_share.csv", "env,variant,seeds,first,last"
-    for seed, scale in enumerate((1, 3)):
-        run = tmp_path / "A-v0" / "beta_1" / f"seed{seed}"
-        run.mkdir(parents=True)
-        shares = [scale * n / 100 for n in range(20)]  # 0.00, 0.01; …; 0.18, 0.19, times scale
-        pd.DataFrame({"bonus_share": shares}).to_csv(run / "diagnostics.csv", index=False)
-    bonus_share.main(file, tmp_path, ["beta_1", "beta_2"])
-    measured = "A-v0,beta_1,2,0.0100,0.3700"
-    assert file.read_text().splitlines() == [heads, measured]
-    other = "B-v0,beta_2,2,0.5000,0.2500"
-    file.write_text("\n".join([heads, other, "A-v0,beta_1,9,0.9,0.9"]))  # the last is of before
-    bonus_share.main(file, tmp_path, ["beta_1"])
-    assert file.read_text().splitlines() == [heads, measured, other]
-    assert runs.shares(tmp_path) == [
-        "| | seeds | beta_1 | beta_2 |",
-        "|---|---|---|---|",
-        "| A-v0 | 2 | 0.01 / 0.37 |  |",
-        "| B-v0 | 2 |  | 0.50 / 0.25 |",
-    ]
-    with pytest.raises(SystemExit, match=r"no diagnostics\.csv of beta_2"):
-        bonus_share.main(file, tmp_path, ["beta_2"])
-
-
 def test_the_betas_of_each_seed_are_in_order_of_size(tmp_path: Path) -> None:
     """20 episodes: those of the last two count."""
     content = {}
@@ -206,18 +161,3 @@ def test_the_betas_of_each_seed_are_in_order_of_size(tmp_path: Path) -> None:
     kept_runs.write(tmp_path / "A-v0" / "mace_full.tar.xz", content)
     assert runs.betas(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.25, 0.55 |"]
     assert runs.lowest(tmp_path, "A-v0")[2:] == ["| A-v0 | 2 | 0.20, 0.50 |"]
-
-
-def test_what_is_measured_of_the_credit_of_beta(tmp_path: Path) -> None:
-    """A short training: every measure of each third, beside those of another environment."""
-    file = tmp_path / "meta_signal.csv"
-    other = {"env": "A-v0", "episodes": 7, "seeds": 2, "measure": "unscaled", "third": [1, 2, 3]}
-    pd.DataFrame(other | {"value": [-0.25, 0, 0.5]}).to_csv(file, index=False)
-    for _ in range(2):  # the second time its rows are replaced
-        meta_signal.main(file, "DeepSea10-v0", 500, 1, ["config/exploration.yaml"])
-    table = pd.read_csv(file)
-    assert len(table) == 3 + 6 * 3
-    cosines = table[table["measure"] == "cosine, as Adam steps"]["value"]
-    assert ((cosines > 0.2) & (cosines <= 1)).all()
-    assert "| A-v0, 7 | 2 | −0.25 / 0.00 / 0.50 |  |" in runs.signals(tmp_path)[2]
-    assert runs.signals(tmp_path)[3].startswith("| DeepSea10-v0, 500 | 1 | ")
