@@ -1,9 +1,13 @@
-"""benchmarks/README.md of benchmarks/measurements.csv: a table for each section that is there."""
+"""benchmarks/README.md of benchmarks/measurements.csv: tables of each section, and two pictures."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import matplotlib
 import pandas as pd
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
 
 from benchmarks import breakdown, purejaxrl, speed, workflow
 from benchmarks.measuring import ENVIRONMENTS, FILE
@@ -26,6 +30,9 @@ def write(folder: Path) -> Path:
         if len(own):
             machine = "; ".join(own["machine"].unique())
             text += f"\n## {title}\n\n{tables(own)}\n\n{machine}\n"
+            if section in PICTURES:
+                PICTURES[section](own).savefig(folder / f"{section}.png", dpi=120)
+                text += f"\n![{title}]({section}.png)\n"
     write_atomically(folder / "README.md", text)
     return folder / "README.md"
 
@@ -109,6 +116,41 @@ SECTIONS = {
     "growth": ("Growth over a long run of `mace_full`", growth_section),
     "workflow": ("The whole workflow", workflow_section),
 }
+
+
+def draw_speed(rows: pd.DataFrame) -> plt.Figure:
+    """Steps per CPU second, logarithmic: medians as bars, ranges as whiskers."""
+    figure, panels = plt.subplots(
+        1, 3, figsize=(13, 3.4), sharex=True, sharey=True, layout="constrained"
+    )
+    for panel, environment in zip(panels, ENVIRONMENTS, strict=True):
+        by = rates(rows)[environment].groupby("contestant")
+        median, low, high = (
+            by.agg(name).reindex(speed.LABELS) for name in ("median", "min", "max")
+        )
+        panel.barh(list(speed.LABELS.values()), median, xerr=[median - low, high - median])
+        panel.set(xscale="log", xlim=(1e3, 3e5), title=environment, xlabel=RATE)
+        panel.grid(axis="x", alpha=0.3)
+    panels[0].invert_yaxis()
+    return figure
+
+
+def draw_breakdown(rows: pd.DataFrame) -> plt.Figure:
+    """µs per step by part of the program, stacked."""
+    figure, panels = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    times = rows.assign(time=1e6 * rows["seconds"] / rows["steps"])
+    for panel, environment in zip(panels, ENVIRONMENTS, strict=True):
+        table = times[times["env"] == environment].pivot(
+            index="contestant", columns="part", values="time"
+        )
+        table = table.loc[list(speed.OURS), breakdown.ALL_SECTIONS].clip(lower=0)
+        table.plot.bar(stacked=True, ax=panel, colormap="tab10", legend=False, rot=0)
+        panel.set(title=environment, xlabel="", ylabel="µs per environment step")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", reverse=True)
+    return figure
+
+
+PICTURES = {"speed": draw_speed, "breakdown": draw_breakdown}
 
 
 def rates(rows: pd.DataFrame) -> pd.Series:

@@ -29,7 +29,7 @@ LABELS = {
     REFERENCE: "stable-baselines3 PPO, 2048 steps, 4 full-batch epochs",
     "ppo_2048": "our PPO, 2048 steps, 4 full-batch epochs",
     "ppo": "our PPO, an update per episode (default)",
-    "mace_full": "our `mace_full`",
+    "mace_full": "our mace_full",
 }
 # Steps of training before the clock starts: imports, compilation and the first updates are over.
 WARM_UP_STEPS = 2048

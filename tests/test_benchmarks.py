@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import breakdown, growth, page, purejaxrl
+from benchmarks import breakdown, page, purejaxrl
 from benchmarks.measuring import FILE, FULL, QUICK
 from mace_rl.results.paper import CARTPOLE, HOPPER
 
@@ -30,19 +30,6 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()
-
-
-@pytest.mark.parametrize("walk", growth.WALKS)
-def test_walks_have_the_shapes_they_stand_for_and_one_length(register, walk):
-    from shared import environment_of
-
-    growth.register()
-    env, model = environment_of(walk), environment_of(growth.WALKS[walk])
-    assert env.observation_size == model.observation_size
-    assert (env.action_space, env.max_steps) == (model.action_space, model.max_steps)
-    env.env.reset()
-    ends = [env.env.step(env.action_space.sample())[2:4] for _ in range(env.max_steps)]
-    assert ends == [(False, False)] * (env.max_steps - 1) + [(False, True)]
 
 
 def test_the_page_is_that_of_the_measurements(tmp_path):

@@ -16,7 +16,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -97,29 +97,24 @@ def cut_off(folder: Path) -> bool:
     return begun(folder) and files.RECORD not in names(folder)
 
 
-class Undisturbed(NamedTuple):
-    """A training that was let alone, and how to begin another one like it."""
-
-    folder: Path
-    seconds: float  # from its first checkpoint on
-    start: Callable[[Path], subprocess.Popen[bytes]]
-
-
 @pytest.fixture(scope="module", params=[*product(ENVIRONMENTS, VARIANTS)], ids="-".join)
-def undisturbed(request: pytest.FixtureRequest, tmp_path_factory) -> Undisturbed:
-    """Of every environment and variant."""
+def undisturbed(request: pytest.FixtureRequest, tmp_path_factory) -> SimpleNamespace:
+    """A training of each environment and variant that was let alone, its folder; its seconds from
+    the first checkpoint on; and `start`, which begins another one like it in a folder.
+    """
     folder, begin = tmp_path_factory.mktemp("undisturbed") / "run", partial(start, *request.param)
     process = begin(folder)
     while not begun(folder) and process.poll() is None:
         time.sleep(0.01)
     began = time.monotonic()
     finish(process)
-    return Undisturbed(folder, time.monotonic() - began, begin)
+    seconds = time.monotonic() - began
+    return SimpleNamespace(folder=folder, seconds=seconds, start=begin)
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_a_killed_training_ends_with_the_same_bits(
-    undisturbed: Undisturbed, moment: str, tmp_path: Path
+    undisturbed: SimpleNamespace, moment: str, tmp_path: Path
 ) -> None:
     delay = random.uniform(0, 0.8 * undisturbed.seconds) if moment == "training" else 0.0
     for attempt in range(ATTEMPTS):  # a training may be faster than the undisturbed one

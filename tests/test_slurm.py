@@ -1,11 +1,14 @@
-"""Slurm: its profile, what is asked of its queue, and a study on a cluster of its own."""
+"""The reduced study on a Slurm cluster of one node, with mishaps: make slurm-test.
+
+It has to write the configuration where Slurm looks for it, outside the project, so it needs root;
+all else of the cluster is in a folder of its own.
+"""
 
 import json
 import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -16,81 +19,12 @@ from pathlib import Path
 
 import psutil
 import pytest
-import yaml
 from shared import contents
-from snakemake.cli import parse_args
 
 from mace_rl import files
-from mace_rl.runs import queueing
 
 ROOT = Path(__file__).parents[1]
-PROFILE = ROOT / "profiles" / "slurm" / "config.yaml"
-
-
-def test_snakemake_knows_every_key_of_the_profile() -> None:
-    _, arguments = parse_args(["--workflow-profile", str(PROFILE), "all"])
-    assert arguments.executor == "slurm" and arguments.logger == ["mace-rl"]
-    assert arguments.retries == 3 and arguments.cores == 1 and arguments.slurm_requeue
-    sizes = arguments.group_components
-    assert sizes == {f"runs_{size}": size for size in sizes.values()}
-
-
-def test_a_key_that_snakemake_does_not_know_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text(PROFILE.read_text() + "slurm-requeues: true\n")
-    with pytest.raises(SystemExit):
-        parse_args(["--workflow-profile", str(tmp_path / "config.yaml"), "all"])
-
-
-def test_the_profile_has_all_of_the_default_one() -> None:
-    default = yaml.safe_load((ROOT / "profiles" / "default" / "config.yaml").read_text())
-    slurm = yaml.safe_load(PROFILE.read_text())
-    # What is computed is of one machine: as many jobs as it has cores.
-    wanted = {key: value for key, value in default.items() if not key.startswith(("__", "?"))}
-    assert "rerun-triggers" in wanted
-    assert {key: slurm.get(key) for key in wanted} == wanted
-
-
-def test_only_trainings_go_into_the_queue() -> None:
-    files = [ROOT / "Snakefile", *(ROOT / "workflow" / "rules").iterdir()]
-    text = "".join(file.read_text() for file in files)
-    local = re.findall(r"^ *localrules:\n((?: +[\w, ]+\n)+)", text, re.MULTILINE)
-    rules = set(re.findall(r"^ *rule (\w+):", text, re.MULTILINE))
-    assert "regret_figure" in rules, "which is there for some studies only"
-    assert rules - set(re.findall(r"\w+", " ".join(local))) == {"train"}
-
-
-def test_minutes_grow_with_the_work(run_config) -> None:
-    compiled, other = run_config("CartPole-v1"), run_config("HopperBulletEnv-v0")
-    assert queueing.minutes(compiled, 0.0) == 2
-    assert queueing.minutes(compiled, 30_000 * 60 * 5) == 7
-    assert queueing.minutes(other, 3_000 * 60 * 5) == 7
-    assert queueing.minutes(run_config("CartPole-v1", engine="torch"), 300 * 60 * 5) == 7
-
-
-@pytest.mark.parametrize(
-    ("minutes", "expected"), [(1, "b"), (12, "b"), (13, "a"), (60, "a"), (61, None), (9999, None)]
-)
-def test_an_entry_holds_as_many_runs_as_two_hours_do(minutes: int, expected: str | None) -> None:
-    assert queueing.entry(minutes, {"a": 2, "b": 10}) == expected
-    assert queueing.entry(minutes, {}) is None
-
-
-@pytest.mark.slow
-def test_a_thousand_short_runs_are_some_dozen_entries() -> None:
-    command = [sys.executable, "-m", "snakemake", "-n", "all", "--workflow-profile", str(PROFILE)]
-    command += ["--config", "environments=[CartPole-v1]", f"seeds={[*range(334)]}".replace(" ", "")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    runs = re.findall(r"^ +rule train:$", done.stdout + done.stderr, re.MULTILINE)
-    entries = re.findall(r"Group job runs_(\d+) ", done.stdout + done.stderr)
-    # 334 runs of PPO, 40 to an entry, and 668 with a bonus, 20 to an entry.
-    assert len(runs) == 1002
-    assert sorted(entries) == ["20"] * 34 + ["40"] * 9
-
-
-# --- the reduced study on a cluster of one node: make slurm-test ----------------------------------
-
-# Slurm looks here only: Snakemake's Slurm plugin hands no SLURM_* variables on. All else of the
-# cluster is in a folder of its own.
+# Slurm looks here only: Snakemake's Slurm plugin hands no SLURM_* variables on.
 CONFIGURATION = Path("/etc/slurm/slurm.conf")
 PROGRAMS = "munged slurmctld slurmd sbatch srun squeue scancel scontrol sinfo"
 PATIENCE = 60.0  # seconds for daemons to start, and for processes to end
@@ -102,7 +36,7 @@ STUDY += ["environment_settings={HopperBulletEnv-v0: {episodes: 500}}"]
 LONG = "HopperBulletEnv-v0"
 # In place of the profile's numbers, so that long runs, too, share entries in a study this small:
 # the 14 shortest are an entry, and every two of Hopper's 4 with a bonus.
-ON_SLURM = ["--workflow-profile", str(PROFILE), "--group-components", "runs_18=18", "runs_2=2"]
+ON_SLURM = ["--workflow-profile", "profiles/slurm", "--group-components", "runs_18=18", "runs_2=2"]
 ON_SLURM += ["--slurm-init-seconds-before-status-checks", "5"]
 ON_SLURM += ["--seconds-between-status-checks", "5"]
 FIRST, SECOND = ("killed", "preempted"), "cancelled"  # in the first or second run of an entry
@@ -119,13 +53,6 @@ def unfit() -> str:
     return "" if os.geteuid() == 0 else f"has to write {CONFIGURATION}, so it needs root"
 
 
-def free_port() -> int:
-    """A port that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def ask(*command: str) -> str:
     """What a command prints."""
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -139,8 +66,6 @@ def configuration(scratch: Path) -> str:
     return f"""
 ClusterName=slurm-test
 SlurmctldHost={name}(127.0.0.1)
-SlurmctldPort={free_port()}
-SlurmdPort={free_port()}
 SlurmUser=root
 AuthType=auth/munge
 # A job that is put back into the queue may start again when its credential is void: in 5 seconds.
@@ -149,8 +74,9 @@ StateSaveLocation={scratch}/state
 SlurmdSpoolDir={scratch}/spool
 SlurmctldPidFile={scratch}/slurmctld.pid
 SlurmdPidFile={scratch}/slurmd.pid
-# Without control groups, which a container may not have.
-ProctrackType=proctrack/linuxproc
+# Without control groups, which a container may not have. By process groups, not by parents: at
+# scancel a job's shell dies first, and what it started would have no parent to be found by.
+ProctrackType=proctrack/pgid
 TaskPlugin=task/affinity
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU_Memory
@@ -211,10 +137,8 @@ def cluster(scratch: Path) -> Iterator[None]:
         ["slurmctld", "-D"],
         ["slurmd", "-D"],
     ]
-    made = [folder for folder in [CONFIGURATION.parent] if not folder.exists()]
     daemons = []
     try:
-        CONFIGURATION.parent.mkdir(exist_ok=True)
         CONFIGURATION.write_text(configuration(scratch), encoding="utf-8")
         for command in commands:
             # In sessions of their own, so that Ctrl-C reaches them last.
@@ -233,8 +157,6 @@ def cluster(scratch: Path) -> Iterator[None]:
         for daemon in reversed(daemons):
             daemon.terminate()
         CONFIGURATION.unlink(missing_ok=True)
-        for folder in made:
-            folder.rmdir()
         for daemon in daemons:
             daemon.wait(PATIENCE)
 
