@@ -30,8 +30,8 @@ def main() -> None:
     for section in SECTIONS if "all" in arguments.sections else arguments.sections:
         if section != "page":
             began = time.monotonic()
-            for rows in import_module(f"benchmarks.{section}").measure(scale):
-                replace_section(scale.folder, section, rows)
+            rows = import_module(f"benchmarks.{section}").measure(scale)
+            replace_section(scale.folder, section, rows)
             print(f"{section}: {time.monotonic() - began:.0f} s", flush=True)
     print(page.write(scale.folder))
 

@@ -5,7 +5,7 @@ The program has no timers of its own: its functions are wrapped here from outsid
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -77,8 +77,8 @@ class Stopwatch:
         self._since = now
 
 
-def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
-    """A row for each part of each of our trainings; all rows until now, after each training."""
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each part of each of our trainings."""
     rows: list[dict[str, Any]] = []
     for environment in ENVIRONMENTS:
         for contestant in OURS:
@@ -88,7 +88,7 @@ def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
             rows += [
                 identity | {"part": part, "seconds": found.get(part, 0.0)} for part in ALL_SECTIONS
             ]
-            yield rows
+    return rows
 
 
 def profile(

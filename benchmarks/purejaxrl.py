@@ -15,7 +15,6 @@ import shutil
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +50,8 @@ class LeftOut(Exception):
     """Why PureJaxRL's packages cannot be had here, in one line."""
 
 
-def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
-    """All readings until now, after each; or a row that says why there are none.
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each reading, or one that says why there are none.
 
     Only what has to be fetched can be left out: a training that fails ends the benchmark.
     """
@@ -60,10 +59,9 @@ def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
         set_up()
     except LeftOut as reason:
         print(f"PureJaxRL is left out: {reason}", flush=True)
-        yield [{"note": str(reason)}]
-        return
+        return [{"note": str(reason)}]
     everybody = {environment: [REFERENCE, *OURS, *ROLLOUTS] for environment in ENVIRONMENTS}
-    yield from speed.in_turn(scale, everybody, reading)
+    return speed.in_turn(scale, everybody, reading)
 
 
 def reading(contestant: str, environment: str, seed: int, steps: int) -> dict[str, Any]:

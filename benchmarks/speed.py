@@ -36,19 +36,19 @@ WARM_UP_STEPS = 2048
 ENDLESS = 10**9  # episodes
 
 
-def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
-    """All readings until now, after each."""
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each reading."""
     everybody = {
         environment: [who for who in LABELS if who != "environment_ours" or environment == HOPPER]
         for environment in ENVIRONMENTS
     }
-    yield from in_turn(scale, everybody, reading)
+    return in_turn(scale, everybody, reading)
 
 
 def in_turn(
     scale: Scale, everybody: Mapping[str, list[str]], read: Callable[..., dict[str, Any]]
-) -> Iterator[list[dict[str, Any]]]:
-    """`read(contestant, environment, seed, steps)` of each; all rows until now, after each.
+) -> list[dict[str, Any]]:
+    """`read(contestant, environment, seed, steps)` of each, a row for each.
 
     Every repeat begins with another contestant: whatever slows the machine down for a while hits
     everybody.
@@ -65,7 +65,7 @@ def in_turn(
                 rows.append(identity | found)
                 rate = found["steps"] / found["cpu_seconds"]
                 print(f"{repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
-                yield rows
+    return rows
 
 
 def reading(contestant: str, environment: str, seed: int, steps: int) -> dict[str, Any]:

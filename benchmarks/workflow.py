@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ BEFORE, AFTER = "before the first training: imports, planning", "after the last:
 WALL, OUTSIDE = "all of it", "per training: imports, start, end, waiting"
 
 
-def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
+def measure(scale: Scale) -> list[dict[str, Any]]:
     """A row for each run of the small workflow, its parts, and the planning of the large one."""
     budget = {"episodes": scale.workflow_episodes}
     small = {
@@ -50,7 +49,7 @@ def measure(scale: Scale) -> Iterator[list[dict[str, Any]]]:
         f"planning {planned} runs, `snakemake -n`": end - start,
     }
     rows = [{"part": part, "seconds": seconds} for part, seconds in parts.items()]
-    yield [run for run, _, _ in jobs] + rows
+    return [run for run, _, _ in jobs] + rows
 
 
 def job(record: Path) -> tuple[dict[str, Any], float, float]:

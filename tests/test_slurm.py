@@ -111,6 +111,8 @@ def scratch(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder for all that the test leaves; fails if a process is left, and ends it."""
     with tempfile.TemporaryDirectory(prefix="slurm-test-") as folder:
         monkeypatch.setenv(MARK, folder)
+        for number in (signal.SIGTERM, signal.SIGHUP):  # like Ctrl-C: all is taken down
+            signal.signal(number, signal.default_int_handler)
         yield Path(folder)
         with suppress(TimeoutError):
             wait_for(lambda: not marked(Path(folder)), "processes to end")
