@@ -35,11 +35,11 @@ all: setup ## the paper's study: every run, table and figure, at the paper's bud
 quick: setup ## the same at small budgets, to see it work (minutes)
 	@$(SNAKEMAKE) all --configfile config/reduced.yaml
 
-test: setup ## every test, on up to 8 cores
+test: setup ## every test but those of cross-cpu, kill-test and slurm-test, on up to 8 cores
 	@$(PYTEST)
 
 test-quick: setup ## the tests that take seconds, for the edit loop
-	@$(PYTEST) -m "not slow"
+	@$(PYTEST) -m "not slow" # which those are, too
 
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
@@ -56,13 +56,13 @@ verify: setup ## repeat a sample of the runs in reference/ and compare to the bi
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
 	@$(call one_of,CROSS,short)
-	@$(IN_VENV) tools.cross_cpu $(if $(CROSS),--short)
+	@$(PYTEST) -v -m emulated
 
 kill-test: setup ## kill trainings and workflows at bad moments and compare to the bit (minutes)
-	@$(IN_VENV) tools.kill_test
+	@$(IN_VENV) pytest -v -m kill
 
 slurm-test: setup ## the reduced study on a Slurm cluster of one node, compared to the bit (minutes)
-	@$(IN_VENV) tools.slurm_test
+	@$(IN_VENV) pytest -sv -m slurm
 
 archive: setup ## the committed tree with checksums as dist/mace-rl-VERSION.tar, for a DOI
 	@$(IN_VENV) tools.deposit

@@ -1,7 +1,5 @@
-"""How fast the project is, next to stable-baselines3, and where the time goes: `make bench`.
+"""How fast the project is, beside stable-baselines3 and PureJaxRL: `make bench`.
 
-A measurement, not a test: nothing here passes or fails. docs/performance.md explains it. Each
-module measures one thing and writes its CSV file; `report` makes tables and pictures of them.
+Each module measures one thing; all their rows are in measurements.csv, and `page` makes README.md
+of them. A measurement, not a test: no time makes anything fail.
 """
-
-import mace_rl  # noqa: F401  (before any of them imports NumPy: equal bits on every processor)

@@ -1,23 +1,25 @@
-"""The benchmark: `python -m benchmarks [PART ...] [--quick]`; `make bench` does it all."""
+"""The benchmark: `python -m benchmarks [SECTION ...] [--quick]`; `make bench` does it all."""
+
+import mace_rl  # noqa: F401  isort: skip  (arithmetic is chosen before NumPy is imported)
 
 import argparse
 import time
 from importlib import import_module
 
-from benchmarks.settings import FULL, QUICK
+from benchmarks import page
+from benchmarks.measuring import FULL, QUICK, replace_section
 
-PARTS = ("speed", "breakdown", "growth", "workflow", "start", "wrapper", "purejaxrl", "arithmetic")
-PARTS += ("update", "report")
+SECTIONS = ("speed", "purejaxrl", "breakdown", "growth", "workflow")
 
 
 def main() -> None:
-    """Carry out the parts that are asked for, each by the function `measure_all` of its module."""
+    """Measure the sections that are asked for, and write the page of all that is there."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description=__doc__,
         epilog="example: python -m benchmarks speed --quick",
     )
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, "all"], default="all")
+    parser.add_argument("sections", nargs="*", choices=[*SECTIONS, "page", "all"], default="all")
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -25,11 +27,13 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     scale = QUICK if arguments.quick else FULL
-    scale.data.mkdir(exist_ok=True)
-    for part in PARTS if "all" in arguments.parts else arguments.parts:
-        start = time.monotonic()
-        import_module(f"benchmarks.{part}").measure_all(scale)
-        print(f"{part}: {time.monotonic() - start:.0f} s", flush=True)
+    for section in SECTIONS if "all" in arguments.sections else arguments.sections:
+        if section != "page":
+            began = time.monotonic()
+            rows = import_module(f"benchmarks.{section}").measure(scale)
+            replace_section(scale.folder, section, rows)
+            print(f"{section}: {time.monotonic() - began:.0f} s", flush=True)
+    print(page.write(scale.folder))
 
 
 if __name__ == "__main__":

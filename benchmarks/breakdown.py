@@ -1,4 +1,4 @@
-"""Where a training's time goes, by section and in µs per step: breakdown.csv.
+"""Where a training's time goes, by part of the program.
 
 The program has no timers of its own: its functions are wrapped here from outside.
 """
@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from benchmarks.process import in_fresh_process, write_rows
-from benchmarks.settings import CARTPOLE, ENVIRONMENTS, FIRST_SEED, HOPPER, OURS, Scale
-from benchmarks.speed import our_config, warm_up
+from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, Scale, in_fresh_process
+from benchmarks.speed import OURS, our_config, warm_up
 from mace_rl.environments import classic_control
+from mace_rl.results.paper import CARTPOLE, HOPPER
 
-# In the order of the stacked bars, each with its functions as they hang on a Trainer. What no
-# function here accounts for is bookkeeping.
+# Each part with its functions as they hang on a Trainer. What no function here accounts for is
+# bookkeeping.
 SECTIONS = {
     "environment": "environment.env.reset environment.env.step",
     "acting": "",  # see `instrument`
@@ -35,7 +35,6 @@ BONUS = {
     "meta network": "controller.next_episode adapt",
 }
 ALL_SECTIONS = list(SECTIONS | BONUS)
-TIME = "microseconds_per_step"
 # Functions of modules: section, module, name.
 FUNCTIONS = (
     ("acting", "mace_rl.train", "draw_noise"),
@@ -78,22 +77,24 @@ class Stopwatch:
         self._since = now
 
 
-def measure_all(scale: Scale) -> None:
-    """Profile all our trainings and write breakdown.csv."""
-    rows = []
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each part of each of our trainings."""
+    rows: list[dict[str, Any]] = []
     for environment in ENVIRONMENTS:
         for contestant in OURS:
-            steps = scale.later_steps[environment]
-            found = in_fresh_process(profile, contestant, environment, FIRST_SEED, steps)
-            identity = {"env": environment, "contestant": contestant}
-            times = [{"section": name, TIME: found.get(name, 0.0)} for name in ALL_SECTIONS]
-            rows += [identity | row for row in times]
-            write_rows(scale.data / "breakdown.csv", rows)
-            print(f"profile: {environment} {contestant}: {sum(found.values()):.1f} µs a step")
+            what = contestant, environment, FIRST_SEED, scale.steps[environment]
+            steps, found = in_fresh_process(profile, *what)
+            identity = {"env": environment, "contestant": contestant, "steps": steps}
+            rows += [
+                identity | {"part": part, "seconds": found.get(part, 0.0)} for part in ALL_SECTIONS
+            ]
+    return rows
 
 
-def profile(contestant: str, environment: str, seed: int, steps: int) -> dict[str, float]:
-    """µs per step by section, over at least `steps` steps from scratch."""
+def profile(
+    contestant: str, environment: str, seed: int, steps: int
+) -> tuple[int, dict[str, float]]:
+    """How many steps were done, at least `steps` from scratch, and seconds by part."""
     from mace_rl.train import Trainer
 
     warm_up(contestant, environment, seed)
@@ -108,7 +109,7 @@ def profile(contestant: str, environment: str, seed: int, steps: int) -> dict[st
         stepping = done * compiled_step_seconds(environment)
         seconds["environment"] += stepping
         seconds["acting"] -= stepping
-    return {section: 1e6 * value / done for section, value in seconds.items()}
+    return done, seconds
 
 
 def instrument(trainer: Any, watch: Stopwatch) -> None:

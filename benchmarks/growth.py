@@ -1,4 +1,4 @@
-"""Whether a long `mace_full` run slows down or grows: growth.csv, one row per episode.
+"""Whether a long `mace_full` run slows down or grows: a row for each tenth of it.
 
 The environments are random walks of fixed length that cost next to nothing, so that every episode
 is the same work and nearly all of it our own.
@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from benchmarks.process import in_fresh_process, memory_mb, write_rows
-from benchmarks.settings import ACROBOT, FIRST_SEED, HOPPER, Scale
+from benchmarks.measuring import FIRST_SEED, Scale, in_fresh_process, memory_mb
 from benchmarks.speed import our_config
+from mace_rl.results.paper import ACROBOT, HOPPER
 
 # Shaped like Acrobot and like Hopper, with their settings and time limits.
 WALKS = {"AcrobotLikeWalk-v0": ACROBOT, "HopperLikeWalk-v0": HOPPER}
@@ -49,30 +49,23 @@ def register() -> None:
         gymnasium.register(name, entry_point=Walk, max_episode_steps=limit, kwargs=arguments)
 
 
-def measure_all(scale: Scale) -> None:
-    """Run `mace_full` on both walks and write growth.csv."""
-    rows: list[dict[str, Any]] = []
-    for walk in WALKS:
-        rows += in_fresh_process(measure, walk, scale.growth_episodes)
-        write_rows(scale.data / "growth.csv", rows)
-        print(f"growth: {walk}: {rows[-1]['cpu_seconds']:.0f} s, {rows[-1]['memory_mb']:.0f} MB")
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """Ten rows for `mace_full` on each of the walks."""
+    found = [in_fresh_process(tenths, walk, scale.growth_episodes) for walk in WALKS]
+    return [row for rows in found for row in rows]
 
 
-def measure(walk: str, episodes: int) -> list[dict[str, Any]]:
-    """Time and memory after each episode of one run."""
+def tenths(walk: str, episodes: int) -> list[dict[str, Any]]:
+    """Steps and CPU time until the end of each tenth of one run, and memory there."""
     from mace_rl.train import Trainer
 
     register()
     config = our_config("mace_full", WALKS[walk], FIRST_SEED)
     trainer = Trainer(config.model_copy(update={"environment": walk, "episodes": episodes}))
-    start = time.process_time()
-    return [
-        {
-            "env": walk,
-            "episode": records[-1].episode,
-            "env_steps": records[-1].env_steps,
-            "cpu_seconds": time.process_time() - start,
-            "memory_mb": memory_mb("VmRSS"),
-        }
-        for records in trainer.run()
-    ]
+    rows, start = [], time.process_time()
+    for records in trainer.run():
+        if records[-1].episode % (episodes // 10) == 0:
+            times = {"cpu_seconds": time.process_time() - start, "memory_mb": memory_mb("VmRSS")}
+            rows.append({"env": walk, "part": str(len(rows) + 1)} | times)
+            rows[-1]["steps"] = records[-1].env_steps
+    return rows

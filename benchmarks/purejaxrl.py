@@ -1,8 +1,11 @@
-"""PureJaxRL's PPO beside ours and stable-baselines3's, steps and CPU time: purejaxrl.csv.
+"""PureJaxRL's PPO beside ours and stable-baselines3's, in turn, in the environments it has, too.
 
-PureJaxRL trains in one compiled JAX program, environments included, and wants other packages than
-this project: it has an environment of its own, made when it is first needed from purejaxrl.lock and
-a clone at `COMMIT`. Where that cannot be made, one line says why, here and in purejaxrl.csv.
+PureJaxRL (Apache-2.0) trains in one compiled JAX program, environments included, and wants other
+packages than this project: it has an environment of its own, made of purejaxrl.lock when it is
+first needed. Where these cannot be had, a line says why, here and in measurements.csv. Its own
+code, two files and their licence, is in purejaxrl.tar.xz, made in a clone of `ADDRESS` by
+
+    git archive COMMIT LICENSE purejaxrl/ppo.py purejaxrl/wrappers.py | xz -9e
 """
 
 import hashlib
@@ -11,14 +14,16 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import tarfile
+from pathlib import Path
 from typing import Any
 
-from benchmarks.process import THREADS, in_fresh_process, write_rows
-from benchmarks.settings import ACROBOT, CARTPOLE, FIRST_SEED, REFERENCE, ROOT, Scale
-from benchmarks.speed import measure, our_config, schedule, versions
+from benchmarks import speed
+from benchmarks.measuring import FIRST_SEED, ROOT, THREADS, Scale
+from benchmarks.speed import OURS, REFERENCE, our_config
+from mace_rl.results.paper import ACROBOT, CARTPOLE
 
-ENVIRONMENTS = (CARTPOLE, ACROBOT)  # those that it has, too
+ENVIRONMENTS = (CARTPOLE, ACROBOT)
 # Its contestants: environments side by side, steps of each in a rollout, minibatches.
 ROLLOUTS = {
     "purejaxrl_4x128": (4, 128, 4),  # its own setting
@@ -26,61 +31,44 @@ ROLLOUTS = {
     "purejaxrl_1x2048": (1, 2048, 1),  # like `REFERENCE` and ppo_2048
 }
 LABELS = {name: f"PureJaxRL PPO, {n} × {length}" for name, (n, length, _) in ROLLOUTS.items()}
-OTHERS = (REFERENCE, "ppo_2048", "ppo", "mace_full")
 
-ADDRESS = "https://github.com/luchris429/purejaxrl"  # PUREJAXRL names another, such as a folder
+ADDRESS = "https://github.com/luchris429/purejaxrl"
 COMMIT = "31756b197773a52db763fdbe6d635e4b46522a73"
-LOCK = ROOT / "benchmarks" / "purejaxrl.lock"
+CODE, LOCK = (ROOT / "benchmarks" / f"purejaxrl.{kind}" for kind in ("tar.xz", "lock"))
 HOME = ROOT / ".venv-purejaxrl"
-CLONE = HOME / "purejaxrl"
 PYTHON = HOME / "bin" / "python"
 
-# One thread, on the processor; nothing asks for a password.
+# One thread, on the processor.
 VARIABLES = dict.fromkeys(THREADS, "1") | {
     "JAX_PLATFORMS": "cpu",
     "NPROC": "1",  # the size of XLA's thread pools
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-    "GIT_TERMINAL_PROMPT": "0",
 }
 
 
 class LeftOut(Exception):
-    """Why there are no measurements of PureJaxRL, in one line."""
+    """Why PureJaxRL's packages cannot be had here, in one line."""
 
 
-def measure_all(scale: Scale) -> None:
-    """Measure everybody in turn and write purejaxrl.csv, anew after each; or why not."""
-    data = scale.data / "purejaxrl.csv"
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each reading, or one that says why there are none.
+
+    Only what has to be fetched can be left out: a training that fails ends the benchmark.
+    """
     try:
         set_up()
-        rows: list[dict[str, Any]] = []
-        for row in measurements(scale):
-            rows.append(row)
-            write_rows(data, rows)
-            rate = row["steps"] / row["cpu_seconds"]
-            print(f"{row['env']} {row['contestant']}: {rate:.0f} steps per CPU second", flush=True)
     except LeftOut as reason:
-        write_rows(data, [{"left_out": str(reason)}])
         print(f"PureJaxRL is left out: {reason}", flush=True)
+        return [{"note": str(reason)}]
+    everybody = {environment: [REFERENCE, *OURS, *ROLLOUTS] for environment in ENVIRONMENTS}
+    return speed.in_turn(scale, everybody, reading)
 
 
-def measurements(scale: Scale) -> Iterator[dict[str, Any]]:
-    """Rows of purejaxrl.csv, with the columns of results.csv."""
-    from mace_rl.runs.provenance import cpu_model
-
-    everybody = {environment: [*OTHERS, *ROLLOUTS] for environment in ENVIRONMENTS}
-    for repeat, environment, contestant in schedule(scale.purejaxrl_repeats, everybody):
-        seed = FIRST_SEED + repeat
-        if contestant in ROLLOUTS:
-            steps = scale.later_steps[environment]
-            reading = train(configuration(contestant, environment, steps), seed)
-            reading["versions"] = f"PureJaxRL {COMMIT[:7]}, {reading['versions']}"
-        else:  # the reference's speed does not depend on when
-            at = scale.steps if contestant == REFERENCE else scale.later_steps
-            (reading,) = in_fresh_process(measure, contestant, environment, seed, [at[environment]])
-            reading["versions"] = versions()
-        identity = {"env": environment, "contestant": contestant, "repeat": repeat}
-        yield identity | reading | {"cpu": cpu_model()}
+def reading(contestant: str, environment: str, seed: int, steps: int) -> dict[str, Any]:
+    """Of one training, compiled beforehand, in a process of its own."""
+    if contestant not in ROLLOUTS:
+        return speed.reading(contestant, environment, seed, steps)
+    return train(configuration(contestant, environment, steps), seed)
 
 
 def configuration(contestant: str, environment: str, steps: int) -> dict[str, Any]:
@@ -107,46 +95,45 @@ def configuration(contestant: str, environment: str, steps: int) -> dict[str, An
 
 
 def train(config: dict[str, Any], seed: int) -> dict[str, Any]:
-    """The reading of one training, compiled beforehand, in a process of its environment."""
-    arguments = (str(CLONE / "purejaxrl"), json.dumps(config), str(seed))
-    command = (str(PYTHON), "-m", "benchmarks.purejaxrl_training", *arguments)
-    return json.loads(carry_out("its training failed", *command).splitlines()[-1])
+    """What purejaxrl_training.py prints, a script of PureJaxRL's environment.
+
+    -I: nothing of this project can be imported there, nor is needed.
+    """
+    script = str(Path(__file__).with_name("purejaxrl_training.py"))
+    arguments = (str(HOME / "purejaxrl"), json.dumps(config), str(seed))
+    said = carry_out("PureJaxRL's training failed", str(PYTHON), "-I", script, *arguments)
+    return json.loads(said.splitlines()[-1])
 
 
 def set_up() -> None:
-    """Make `HOME`, unless it is there, complete, and of this lock, commit and folder."""
-    made_of = f"{HOME}\n{COMMIT}\n{LOCK.read_text(encoding='utf-8')}"
-    complete = HOME / f"complete-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
+    """Make `HOME`, unless it is there, complete, and of this place, lock and code.
+
+    `LeftOut` if its packages cannot be had.
+    """
+    made_of = str(HOME).encode() + LOCK.read_bytes() + CODE.read_bytes()
+    complete = HOME / f"complete-{hashlib.sha256(made_of).hexdigest()[:16]}"
     if complete.exists():
         return
     print(f"Setting up {HOME.name} (once: 800 MB) ...", flush=True)
     shutil.rmtree(HOME, ignore_errors=True)
-    source = os.environ.get("PUREJAXRL") or ADDRESS
-    fetching = f"its code cannot be had from {source} (PUREJAXRL can name a clone)"
-    carry_out(fetching, "git", "clone", "--quiet", "--no-checkout", source, str(CLONE))
-    carry_out(fetching, "git", "-C", str(CLONE), "checkout", "--quiet", "--detach", COMMIT)
     carry_out("its environment cannot be made", sys.executable, "-m", "venv", str(HOME))
+    with tarfile.open(CODE) as tar:
+        tar.extractall(HOME, filter="data")
     pip = (str(PYTHON), "-m", "pip", "install", "--no-deps", "--only-binary=:all:", "--no-compile")
-    carry_out("its packages cannot be had", *pip, "--require-hashes", "-r", str(LOCK))
+    failure = "its packages cannot be had"
+    carry_out(failure, *pip, "--require-hashes", "-r", str(LOCK), error=LeftOut)
     complete.touch()
 
 
-def carry_out(failure: str, *command: str) -> str:
-    """What the command prints; if it fails, `LeftOut` says `failure` and what it complained of."""
-    try:
-        done = subprocess.run(
-            command,
-            cwd=ROOT,
-            env=os.environ | VARIABLES,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-        )
-    except OSError as error:
-        raise LeftOut(f"{failure}: {error}") from None
+def carry_out(failure: str, *command: str, error: type[BaseException] = SystemExit) -> str:
+    """What the command prints; if it fails, `error` says `failure` and what it complained of."""
+    variables = os.environ | VARIABLES
+    done = subprocess.run(
+        command, cwd=ROOT, env=variables, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
     if done.returncode:
         said = done.stderr.split("\n") if done.stderr.strip() else [f"exit code {done.returncode}"]
-        errors = [line for line in said if line.startswith(("fatal:", "ERROR:"))]
+        errors = [line for line in said if line.startswith("ERROR:")]
         complaint = (errors or [line for line in said if line.strip()])[-1]
-        raise LeftOut(f"{failure}: {complaint.strip()}")
+        raise error(f"{failure}: {complaint.strip()}")
     return done.stdout

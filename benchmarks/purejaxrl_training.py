@@ -1,17 +1,18 @@
-"""One training of PureJaxRL, timed: `python -m benchmarks.purejaxrl_training FOLDER CONFIG SEED`.
+"""One training of PureJaxRL, timed: `python -I purejaxrl_training.py FOLDER CONFIG SEED`.
 
-Runs in the environment that `purejaxrl` makes, and prints the reading as JSON. FOLDER has ppo.py.
+A script of the environment that `benchmarks.purejaxrl` makes; it imports nothing of this project,
+and prints the reading as JSON. FOLDER has PureJaxRL's ppo.py.
 """
 
 import json
 import os
+import re
 import sys
 import time
 from importlib import import_module, metadata
+from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
-
-from benchmarks.process import memory_mb
 
 # Simulators of environments that are not measured here: wrappers.py imports them all the same.
 UNUSED = "brax brax.envs brax.envs.wrappers brax.envs.wrappers.training navix"
@@ -33,17 +34,15 @@ def measure(folder: str, config: dict[str, Any], seed: int) -> dict[str, Any]:
     train = program.lower(key).compile()
     jax.block_until_ready(train(jax.random.PRNGKey(seed + 10**6)))
     seconds, cpu_seconds = time.perf_counter(), time.process_time()
-    jax.block_until_ready(train(key))
+    outcome = jax.block_until_ready(train(key))
     seconds, cpu_seconds = time.perf_counter() - seconds, time.process_time() - cpu_seconds
-    steps = config["TOTAL_TIMESTEPS"]
+    [peak] = re.findall(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text(encoding="ascii"))
     return {
-        "target_steps": steps,
-        "steps": steps,
+        "steps": outcome["metrics"]["returned_episode"].size,
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
-        "steps_per_second": steps / seconds,
-        "peak_memory_mb": memory_mb("VmHWM"),
-        "versions": ", ".join(f"{name} {metadata.version(name)}" for name in PACKAGES.split()),
+        "memory_mb": int(peak) / 1024,
+        "note": ", ".join(f"{name} {metadata.version(name)}" for name in PACKAGES.split()),
     }
 
 

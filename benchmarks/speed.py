@@ -1,108 +1,98 @@
-"""Steps per second of everything in `settings.LABELS`, in turn: results.csv.
+"""Environment steps per CPU second of ours and stable-baselines3's PPO, in turn.
 
 What is timed are iterators that work while they are iterated over and yield the environment steps
-done so far, whenever that is known. What happens before the first `next` is not timed.
+done so far. What happens before the first `next` is not timed.
 """
 
-import platform
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from importlib import metadata
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
-from benchmarks.process import in_fresh_process, memory_mb, write_rows
-from benchmarks.settings import ENVIRONMENTS, FIRST_SEED, OURS, ROOT, Scale, contestants
+from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, ROOT, Scale, in_fresh_process, memory_mb
+from mace_rl.results.paper import HOPPER
 
 if TYPE_CHECKING:  # imported where it is used: the others' memory should not hold it
     from mace_rl.config.run import RunConfig
 
+REFERENCE = "sb3_2048x4"  # the faster of the two peers: ratios are to it
+# Ours, and their variants, with the study's settings but for the first.
+OURS = {"ppo_2048": "ppo", "ppo": "ppo", "mace_full": "mace_full"}
+# Everything that is timed, and its name in tables.
+LABELS = {
+    "environment": "environment alone, the library's",
+    "environment_ours": "environment alone, ours",
+    "sb3": "stable-baselines3 PPO, defaults",
+    REFERENCE: "stable-baselines3 PPO, 2048 steps, 4 full-batch epochs",
+    "ppo_2048": "our PPO, 2048 steps, 4 full-batch epochs",
+    "ppo": "our PPO, an update per episode (default)",
+    "mace_full": "our mace_full",
+}
 # Steps of training before the clock starts: imports, compilation and the first updates are over.
 WARM_UP_STEPS = 2048
 ENDLESS = 10**9  # episodes
-PACKAGES = "torch numpy numba gymnasium pybullet pybullet-envs-gymnasium stable-baselines3"
 
 
-def measure_all(scale: Scale) -> None:
-    """Carry out all measurements and write results.csv, anew after each."""
-    from mace_rl.runs.provenance import cpu_model
-
-    rows = []
-    everybody = {environment: contestants(environment) for environment in ENVIRONMENTS}
-    for repeat, environment, contestant in schedule(scale.repeats, everybody):
-        stops = marks(scale, environment, contestant)
-        seed = FIRST_SEED + repeat
-        for reading in in_fresh_process(measure, contestant, environment, seed, stops):
-            identity = {"env": environment, "contestant": contestant, "repeat": repeat}
-            rows.append(identity | reading | {"cpu": cpu_model(), "versions": versions()})
-        write_rows(scale.data / "results.csv", rows)
-        rate = rows[-1]["steps_per_second"]
-        print(f"repeat {repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each reading."""
+    everybody = {
+        environment: [who for who in LABELS if who != "environment_ours" or environment == HOPPER]
+        for environment in ENVIRONMENTS
+    }
+    return in_turn(scale, everybody, reading)
 
 
-def versions() -> str:
-    """Of Python and of what everybody computes with."""
-    found = [f"{name} {metadata.version(name)}" for name in PACKAGES.split()]
-    return ", ".join([f"python {platform.python_version()}", *found])
+def in_turn(
+    scale: Scale, everybody: Mapping[str, list[str]], read: Callable[..., dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """`read(contestant, environment, seed, steps)` of each, a row for each.
 
-
-def schedule(repeats: int, everybody: Mapping[str, list[str]]) -> Iterator[tuple[int, str, str]]:
-    """(repeat, environment, contestant), in turn; every repeat begins with another contestant.
-
-    So whatever slows the machine down for a while, or warms it up, hits everybody.
+    Every repeat begins with another contestant: whatever slows the machine down for a while hits
+    everybody.
     """
-    for repeat in range(repeats):
+    rows: list[dict[str, Any]] = []
+    for repeat in range(scale.repeats):
         for environment, names in everybody.items():
             first = repeat % len(names)
             for contestant in names[first:] + names[:first]:
-                yield repeat, environment, contestant
+                peer = contestant.startswith(("environment", "sb3"))
+                steps = (scale.peer_steps if peer else scale.steps)[environment]
+                found = read(contestant, environment, FIRST_SEED + repeat, steps)
+                identity = {"env": environment, "contestant": contestant, "repeat": repeat}
+                rows.append(identity | found)
+                rate = found["steps"] / found["cpu_seconds"]
+                print(f"{repeat + 1}: {environment} {contestant}: {rate:.0f} steps/s", flush=True)
+    return rows
 
 
-def marks(scale: Scale, environment: str, contestant: str) -> list[int]:
-    """The numbers of steps at which the clock is read."""
-    if contestant.startswith("environment"):
-        return [scale.environment_steps[environment]]
-    later = [scale.later_steps[environment]] if contestant in OURS else []
-    return [scale.steps[environment], *later]
+def reading(contestant: str, environment: str, seed: int, steps: int) -> dict[str, Any]:
+    """Of one training of at least `steps` steps, in a process of its own."""
+    return in_fresh_process(warm_reading, contestant, environment, seed, steps)
 
 
-def measure(contestant: str, environment: str, seed: int, stops: list[int]) -> list[dict[str, Any]]:
-    """The readings of one training, after another one as a warm-up."""
+def warm_reading(contestant: str, environment: str, seed: int, steps: int) -> dict[str, Any]:
+    """The same, in this process, after a short training with another seed."""
     warm_up(contestant, environment, seed)
-    return read_clock(start(contestant, environment, seed, stops[-1]), stops)
+    return read_clock(start(contestant, environment, seed, steps), steps)
 
 
 def warm_up(contestant: str, environment: str, seed: int) -> None:
     """A short training with another seed."""
-    read_clock(start(contestant, environment, seed + 10**6, WARM_UP_STEPS), [WARM_UP_STEPS])
+    read_clock(start(contestant, environment, seed + 10**6, WARM_UP_STEPS), WARM_UP_STEPS)
 
 
-def read_clock(progress: Iterable[int], stops: list[int]) -> list[dict[str, Any]]:
-    """Iterate until the last of `stops` steps is reached, reading the clock at each of them.
-
-    `steps`, those actually done, can be a little more: updates follow whole episodes.
-    """
-    readings: list[dict[str, Any]] = []
+def read_clock(progress: Iterable[int], stop: int) -> dict[str, Any]:
+    """Time until `stop` steps are reached; `steps` can be a little more: whole episodes."""
     seconds, cpu_seconds = time.perf_counter(), time.process_time()
     for steps in progress:
-        while steps >= stops[len(readings)]:
-            elapsed = time.perf_counter() - seconds
-            readings.append(
-                {
-                    "target_steps": stops[len(readings)],
-                    "steps": steps,
-                    "seconds": elapsed,
-                    "cpu_seconds": time.process_time() - cpu_seconds,
-                    "steps_per_second": steps / elapsed,
-                    "peak_memory_mb": memory_mb("VmHWM"),
-                }
-            )
-            if len(readings) == len(stops):
-                return readings
-    raise RuntimeError(f"ended after {steps} steps, before {stops[-1]}")
+        if steps >= stop:
+            times = {"seconds": time.perf_counter() - seconds}
+            times |= {"cpu_seconds": time.process_time() - cpu_seconds}
+            return {"steps": steps} | times | {"memory_mb": memory_mb("VmHWM")}
+    raise RuntimeError(f"ended before {stop} steps")
 
 
 def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[int]:
@@ -110,13 +100,13 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
     match contestant:
         case "environment":
             return alone(gymnasium.make(environment, disable_env_checker=True), seed, steps)
-        case "environment_fast":
+        case "environment_ours":
             from mace_rl.environments.environment import Environment
             from mace_rl.streams import Streams
 
             ours = Environment(environment, Streams(seed).sequence("environment"))
             return alone(ours.env, seed, steps)
-        case "sb3_default":
+        case "sb3":
             return stable_baselines3(environment, seed, steps)
         case "sb3_2048x4":
             full_batch = {"n_steps": 2048, "batch_size": 2048, "n_epochs": 4}

@@ -1,7 +1,6 @@
-"""What Snakemake, imports and file writing add to training: workflow.csv and planning.csv.
+"""What Snakemake, imports and file writing add to training.
 
-A small study is run for real, with two jobs at a time, in a folder of its own; what it shows is
-extrapolated to the paper's budgets by `summaries.paper_budget`. A large study is only planned.
+A small study is run for real, two jobs at a time, in a folder of its own; a large one is planned.
 """
 
 import json
@@ -14,14 +13,18 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import yaml
 
-from benchmarks.settings import CORES, ENVIRONMENTS, ROOT, Scale
+from benchmarks.measuring import ENVIRONMENTS, ROOT, Scale
+from mace_rl.results.paper import VARIANTS
+
+CORES = 2
+BEFORE, AFTER = "before the first training: imports, planning", "after the last: tables, figures"
+WALL, OUTSIDE = "all of it", "per training: imports, start, end, waiting"
 
 
-def measure_all(scale: Scale) -> None:
-    """Run the small workflow, plan the large one, write both files."""
+def measure(scale: Scale) -> list[dict[str, Any]]:
+    """A row for each run of the small workflow, its parts, and the planning of the large one."""
     budget = {"episodes": scale.workflow_episodes}
     small = {
         "seeds": list(range(scale.workflow_seeds)),
@@ -31,37 +34,37 @@ def measure_all(scale: Scale) -> None:
     with tempfile.TemporaryDirectory(prefix="mace-rl-workflow-") as folder:
         began, ended = snakemake(Path(folder), small, "--cores", str(CORES), "all")
         records = sorted(Path(folder).glob("results/runs/*/*/seed*/run.json"))
-        jobs = pd.DataFrame([job(record) for record in records])
-    jobs = jobs.assign(workflow_began=began, workflow_ended=ended)
-    jobs.to_csv(scale.data / "workflow.csv", index=False)
-    print(f"workflow: {len(jobs)} runs in {ended - began:.0f} s")
-
-    variants = yaml.safe_load((ROOT / "config.yaml").read_text(encoding="utf-8"))
-    variants = list(variants["variant_settings"])
-    large = {"variants": variants, "seeds": list(range(scale.planned_seeds))}
+        jobs = [job(record) for record in records]
+    first, last = min(began for _, began, _ in jobs), max(ended for _, _, ended in jobs)
+    idle = CORES * (last - first) - sum(run["seconds"] for run, _, _ in jobs)
+    large = {"seeds": list(range(scale.planned_seeds))}
     with tempfile.TemporaryDirectory(prefix="mace-rl-planning-") as folder:
-        began, ended = snakemake(Path(folder), large, "-n", "--quiet", "all")
-    runs = len(ENVIRONMENTS) * len(variants) * scale.planned_seeds
-    planning = pd.DataFrame({"runs": [runs], "seconds": [ended - began]})
-    planning.to_csv(scale.data / "planning.csv", index=False)
-    print(f"planning: {runs} runs in {ended - began:.1f} s")
+        start, end = snakemake(Path(folder), large, "-n", "--quiet", "all")
+    planned = len(ENVIRONMENTS) * len(VARIANTS) * scale.planned_seeds
+    parts = {
+        f"{len(jobs)} trainings of {scale.workflow_episodes} episodes: {WALL}": ended - began,
+        BEFORE: first - began,
+        AFTER: ended - last,
+        OUTSIDE: idle / len(jobs),
+        f"planning {planned} runs, `snakemake -n`": end - start,
+    }
+    rows = [{"part": part, "seconds": seconds} for part, seconds in parts.items()]
+    return [run for run, _, _ in jobs] + rows
 
 
-def job(record: Path) -> dict[str, Any]:
-    """One run of the workflow: seconds of training, and when its job began and ended."""
+def job(record: Path) -> tuple[dict[str, Any], float, float]:
+    """A run of the workflow, and when its job began and ended."""
     run = json.loads(record.read_text(encoding="utf-8"))
     results, folder = record.parents[4], record.relative_to(record.parents[3]).parent
     benchmark = results / "benchmarks" / "train" / folder.with_suffix(".tsv")
     ended = benchmark.stat().st_mtime  # Snakemake writes it when the job is over
-    return {
-        "env": run["config"]["environment"],
-        "variant": run["config"]["variant"],
-        "seed": run["config"]["seed"],
-        "training_seconds": run["seconds"],
-        "job_began": ended - pd.read_csv(benchmark, sep="\t")["s"][0],
-        "job_ended": ended,
-        "peak_memory_mb": run["peak_memory_mb"],
-    }
+    names, values = (line.split("\t") for line in benchmark.read_text().splitlines())
+    seconds = float(dict(zip(names, values, strict=True))["s"])
+    config = run["config"]
+    identity = {"env": config["environment"], "contestant": config["variant"]}
+    identity |= {"repeat": config["seed"], "part": "training"}
+    cost = {"seconds": run["seconds"], "memory_mb": run["peak_memory_mb"]}
+    return identity | cost, ended - seconds, ended
 
 
 def snakemake(folder: Path, settings: dict[str, Any], *arguments: str) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -113,6 +114,19 @@ def files(directory: Path) -> list[str]:
 
 def provenance_of(directory: Path) -> dict:
     return json.loads((directory / "run.json").read_text(encoding="utf-8"))
+
+
+def contents(results: Path) -> dict[str, bytes]:
+    """By name what a study has to give again: all but what tells of the circumstances."""
+    circumstances = {"logs", "benchmarks", "run.json", LOCK}
+    return {
+        # The claim ledger says how long all trainings took.
+        str(path.relative_to(results)): re.sub(rb"[^,\n]*core.hours.*", b"", path.read_bytes())
+        if path.stem == "claims"
+        else path.read_bytes()
+        for path in sorted(results.rglob("*"))
+        if path.is_file() and not circumstances.intersection(path.relative_to(results).parts)
+    }
 
 
 def call(monkeypatch, *words: str) -> tuple[int, str]:

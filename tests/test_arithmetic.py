@@ -72,7 +72,7 @@ def test_a_library_that_was_loaded_before_is_noticed(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("package", ["tools.tables", "benchmarks.tables"])
+@pytest.mark.parametrize("package", ["tools.tables", "benchmarks.__main__"])
 def test_what_a_checkout_runs_chooses_before_numpy_is_loaded(package: str) -> None:
     # A type that every processor has: what reads it before it is chosen computes with it.
     code = f"import {package}\nfrom mace_rl.arithmetic import in_use\nprint(in_use()['blas'])"

@@ -1,6 +1,6 @@
 """Measure the mean return of uniformly random actions, for `metrics.random_return` in config.yaml.
 
-.venv/bin/python -m tools.random_return ENVIRONMENT EPISODES [CONFIG ...]
+    .venv/bin/python -m tools.random_return ENVIRONMENT EPISODES [CONFIG ...]
 
 The environment is the one that a study trains in: with the time limit and the arguments that
 config.yaml, and the files CONFIG read over it, set for it.
@@ -16,21 +16,22 @@ import numpy as np
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import Study, load_study
+from mace_rl.config.study import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def study_with(overlays: list[str]) -> Study:
-    """The study of config.yaml and the files over it, but in the environments of the former.
+def configuration(environment: str, overlays: list[str]) -> RunConfig:
+    """Of a run in `environment`, which needs no random return yet; `ConfigError` if there is none.
 
-    Those of the latter need no random return yet. `ConfigError` for what cannot be a study.
+    The study's own environments are those of config.yaml, whatever the files over it say.
     """
     base = config = read_yaml(ROOT / "config.yaml")
     for overlay in overlays:
         config = merge(config, read_yaml(Path(overlay)))
-    environments = {"environments": base["environments"]}
-    return load_study(config | environments, " + ".join(["config.yaml", *overlays]))
+    origin = " + ".join(["config.yaml", *overlays])
+    study = load_study(config | {"environments": base["environments"]}, origin)
+    return study.run_config(environment, "ppo", 0)
 
 
 def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
@@ -74,8 +75,7 @@ def main() -> None:
     if episodes < 2:
         sys.exit(f"random_return: EPISODES is {episodes}, but should be at least 2")
     try:
-        config = study_with(arguments.configs).run_config(name, "ppo", 0)
-        measured = random_returns(config, episodes)
+        measured = random_returns(configuration(name, arguments.configs), episodes)
     except ConfigError as error:
         sys.exit(f"random_return: {error}")
     standard_error = measured.std(ddof=1) / np.sqrt(episodes)

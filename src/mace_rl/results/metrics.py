@@ -152,7 +152,7 @@ def convergence_steps(curve: LearningCurve) -> Episode:
 
     Our reading: the first episode, once the average has come threshold of the way from random to
     final, at which its slope is down to `convergence_slope` of the steepest so far. It is steady
-    from seed to seed and sees a delay (tools.convergence_simulation; docs/metrics.md).
+    from seed to seed and sees a delay (simulated: docs/metrics.md).
 
     Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
     """

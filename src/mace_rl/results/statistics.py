@@ -248,7 +248,7 @@ def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndar
 
     The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
     the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
-    a bootstrap over 10 seeds is too narrow otherwise (tools.interval_coverage). With one seed, and
+    a bootstrap over 10 seeds is too narrow otherwise (docs/metrics.md). With one seed, and
     where one of `estimates` is NaN, NaN.
     """
     if seeds == 1:

@@ -1,0 +1,196 @@
+"""benchmarks/README.md of benchmarks/measurements.csv: tables of each section, and two pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import pandas as pd
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+from benchmarks import breakdown, purejaxrl, speed, workflow
+from benchmarks.measuring import ENVIRONMENTS, FILE
+from mace_rl.files import write_atomically
+
+HEAD = """# Measurements
+
+Written by `python -m benchmarks` (`make bench`) from [measurements.csv](measurements.csv): change
+neither by hand. [docs/performance.md](../docs/performance.md) explains them.
+"""
+RATE = "environment steps per CPU second"
+
+
+def write(folder: Path) -> Path:
+    """Write the page of the folder's measurements, and return its path."""
+    rows = pd.read_csv(folder / FILE)
+    text = HEAD
+    for section, (title, tables) in SECTIONS.items():
+        own = rows[rows["section"] == section].dropna(axis="columns", how="all")
+        if len(own):
+            machine = "; ".join(own["machine"].unique())
+            text += f"\n## {title}\n\n{tables(own)}\n\n{machine}\n"
+            if section in PICTURES:
+                PICTURES[section](own).savefig(folder / f"{section}.png", dpi=120)
+                text += f"\n![{title}]({section}.png)\n"
+    write_atomically(folder / "README.md", text)
+    return folder / "README.md"
+
+
+def speed_section(rows: pd.DataFrame) -> str:
+    """Steps per CPU second of everybody, with the ratio to the reference within each repeat."""
+    steps = rows.pivot_table(index="contestant", columns="env", values="steps", aggfunc="median")
+    share = (rows["cpu_seconds"] / rows["seconds"]).median()
+    return "\n\n".join(
+        [
+            rates_table(rows, speed.LABELS),
+            by_environment(
+                "steps of a training, median",
+                steps.reindex(speed.LABELS).dropna(how="all"),
+                ",.0f",
+                speed.LABELS,
+            ),
+            f"The measured processes had the processor for {share:.0%} of the time (median).",
+        ]
+    )
+
+
+def purejaxrl_section(rows: pd.DataFrame) -> str:
+    """The same with PureJaxRL, and ours relative to each of its; or why it was left out."""
+    if "contestant" not in rows:
+        return f"PureJaxRL was left out: {rows['note'].iloc[0]}"
+    labels = {name: speed.LABELS[name] for name in (speed.REFERENCE, *speed.OURS)}
+    labels |= purejaxrl.LABELS
+    found, lines = rates(rows), []
+    for environment in purejaxrl.ENVIRONMENTS:
+        for ours in speed.OURS:
+            ratios = (
+                found[environment, ours] / found[environment, its] for its in purejaxrl.LABELS
+            )
+            cells = [median_and_range(ratio, ".2f") for ratio in ratios]
+            lines.append([f"{labels[ours]}, {environment}", *cells])
+    against = [f"÷ {label}" for label in purejaxrl.LABELS.values()]
+    table = markdown(pd.DataFrame(lines, columns=[f"ratio of {RATE}", *against]), against)
+    [packages] = rows["note"].dropna().unique()
+    return f"{rates_table(rows, labels)}\n\n{table}\n\n{packages}"
+
+
+def breakdown_section(rows: pd.DataFrame) -> str:
+    """µs per step: parts of the program by environment and contestant."""
+    columns = [(environment, name) for environment in ENVIRONMENTS for name in speed.OURS]
+    rows = rows.assign(time=1e6 * rows["seconds"] / rows["steps"])
+    table = rows.pivot(index="part", columns=["env", "contestant"], values="time")
+    table = table.loc[breakdown.ALL_SECTIONS].reindex(columns=columns)
+    table.loc["sum"] = table.sum()
+    table.columns = [" ".join(column) for column in columns]
+    return markdown(table.map("{:.1f}".format).reset_index(names="µs per step"), table.columns)
+
+
+def growth_section(rows: pd.DataFrame) -> str:
+    """One row per walk: its last tenth beside its second."""
+    lines = []
+    for walk, run in rows.groupby("env", sort=False):
+        parts = run[["steps", "cpu_seconds"]].diff()
+        per_step = (1e6 * parts["cpu_seconds"] / parts["steps"]).tolist()
+        memory, steps = run["memory_mb"].tolist(), run["steps"].iloc[-1]
+        times = [f"{per_step[1]:.1f}", f"{per_step[-1]:.1f}", f"{per_step[-1] / per_step[1]:.2f}"]
+        lines.append([walk, f"{steps:,.0f}", *times, f"{memory[1]:.0f}", f"{memory[-1]:.0f}"])
+    columns = ["steps", "µs per step, second tenth", "last tenth", "ratio"]
+    columns += ["MB after the second tenth", "at the end"]
+    return markdown(pd.DataFrame(lines, columns=["environment", *columns]), columns)
+
+
+def workflow_section(rows: pd.DataFrame) -> str:
+    """What the small workflow took, and the peak memory of its trainings."""
+    runs = rows["part"] == "training"
+    parts = rows[~runs].assign(seconds=rows["seconds"].map("{:.1f}".format))
+    parts = parts[["part", "seconds"]].set_axis([f"on {workflow.CORES} cores", "seconds"], axis=1)
+    peaks = rows[runs].pivot_table("memory_mb", "contestant", "env", aggfunc="max", sort=False)
+    return f"{markdown(parts, ['seconds'])}\n\n{by_environment('peak memory, MB', peaks, '.0f')}"
+
+
+SECTIONS = {
+    "speed": ("Speed", speed_section),
+    "purejaxrl": ("Beside PureJaxRL", purejaxrl_section),
+    "breakdown": ("Where a step's time goes", breakdown_section),
+    "growth": ("Growth over a long run of `mace_full`", growth_section),
+    "workflow": ("The whole workflow", workflow_section),
+}
+
+
+def draw_speed(rows: pd.DataFrame) -> plt.Figure:
+    """Steps per CPU second, logarithmic: medians as bars, ranges as whiskers."""
+    figure, panels = plt.subplots(
+        1, 3, figsize=(13, 3.4), sharex=True, sharey=True, layout="constrained"
+    )
+    for panel, environment in zip(panels, ENVIRONMENTS, strict=True):
+        by = rates(rows)[environment].groupby("contestant")
+        median, low, high = (
+            by.agg(name).reindex(speed.LABELS) for name in ("median", "min", "max")
+        )
+        panel.barh(list(speed.LABELS.values()), median, xerr=[median - low, high - median])
+        panel.set(xscale="log", xlim=(1e3, 3e5), title=environment, xlabel=RATE)
+        panel.grid(axis="x", alpha=0.3)
+    panels[0].invert_yaxis()
+    return figure
+
+
+def draw_breakdown(rows: pd.DataFrame) -> plt.Figure:
+    """µs per step by part of the program, stacked."""
+    figure, panels = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    times = rows.assign(time=1e6 * rows["seconds"] / rows["steps"])
+    for panel, environment in zip(panels, ENVIRONMENTS, strict=True):
+        table = times[times["env"] == environment].pivot(
+            index="contestant", columns="part", values="time"
+        )
+        table = table.loc[list(speed.OURS), breakdown.ALL_SECTIONS].clip(lower=0)
+        table.plot.bar(stacked=True, ax=panel, colormap="tab10", legend=False, rot=0)
+        panel.set(title=environment, xlabel="", ylabel="µs per environment step")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", reverse=True)
+    return figure
+
+
+PICTURES = {"speed": draw_speed, "breakdown": draw_breakdown}
+
+
+def rates(rows: pd.DataFrame) -> pd.Series:
+    """Steps per CPU second by environment, contestant and repeat."""
+    by = rows.set_index(["env", "contestant", "repeat"]).sort_index()
+    return by["steps"] / by["cpu_seconds"]
+
+
+def rates_table(rows: pd.DataFrame, labels: dict[str, str]) -> str:
+    """Median and range over the repeats, and the median ratio to the reference in a repeat."""
+    cells = {}
+    for (environment, contestant), rate in rates(rows).groupby(level=["env", "contestant"]):
+        reference = rates(rows)[environment, speed.REFERENCE]
+        ratio = (rate.droplevel(["env", "contestant"]) / reference).median()
+        cells[contestant, environment] = f"{median_and_range(rate, ',.0f')}, {ratio:.1f}×"
+    table = pd.Series(cells).unstack().reindex(labels)
+    return by_environment(f"{RATE} (× {labels[speed.REFERENCE]})", table, "", labels)
+
+
+def by_environment(
+    name: str, table: pd.DataFrame, form: str, labels: dict[str, str] | None = None
+) -> str:
+    """`table`, whose columns are environments and whose index is called `name`."""
+    there = [environment for environment in ENVIRONMENTS if environment in table]
+    cells = table[there].map(lambda value: format(value, form), na_action="ignore").fillna("–")
+    cells = cells.rename(index=labels or {})
+    return markdown(cells.reset_index(names=name), there)
+
+
+def median_and_range(values: pd.Series, form: str) -> str:
+    """Over the repeats."""
+    numbers = (format(value, form) for value in (values.median(), values.min(), values.max()))
+    return "{} ({} to {})".format(*numbers)
+
+
+def markdown(table: pd.DataFrame, numbers: Sequence[str]) -> str:
+    """A Markdown table without the index; the columns `numbers` are right-aligned."""
+    rows = [
+        list(table.columns),
+        ["--:" if column in numbers else "---" for column in table.columns],
+        *table.astype(str).to_numpy().tolist(),
+    ]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)

@@ -1,0 +1,70 @@
+"""What tests/test_cross_cpu.py lets a processor do: `python emulated.py TASKS`, a JSON list.
+
+One process for all tasks: emulated, importing and compiling take minutes. A task is an environment,
+a variant, a folder and whether to stop half way; or "tables" and a folder.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+ROOT = Path(__file__).resolve().parents[1]
+# More than the 10 updates after which the meta network learns.
+EPISODES = {"Acrobot-v1": 14, "CartPole-v1": 60, "HopperBulletEnv-v0": 60}
+# So small that memory and buffer are full before the end, and what is in them is replaced.
+CHANGES = {"memory": {"capacity": 50}, "novelty": {"buffer_size": 100}}
+TABLES = ["table1.csv", "table1.tex", "figure1.pdf", "figure1.png"]  # of the runs in reference/
+
+
+class Interrupted(Exception):
+    """A training was, as it should be."""
+
+
+def train(environment: str, variant: str, folder: str, halt: bool) -> None:
+    """Train, or begin to: half of the episodes, and what is left is a checkpoint."""
+    from mace_rl.cli import CONFIG
+    from mace_rl.config.reading import merge_layers
+    from mace_rl.config.run import RunConfig
+    from mace_rl.config.section import check
+    from mace_rl.config.study import read_study
+    from mace_rl.runs import run
+
+    settings = read_study([CONFIG]).run_config(environment, variant, 0).settings()
+    changes: dict[str, Any] = {key: value for key, value in CHANGES.items() if key in settings}
+    changes["episodes"] = EPISODES[environment]
+    config = check(RunConfig, merge_layers(settings, changes), "tests/emulated.py")
+    if not halt:
+        run.run(config, Path(folder))
+        return
+
+    def interrupt(progress: dict[str, Any]) -> None:
+        if progress["episode"] > config.episodes // 2:
+            raise Interrupted
+
+    every_round = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "OBSERVER_SECONDS": 0.0}
+    try:
+        with patch.multiple(run, **every_round):
+            run.run(config, Path(folder), interrupt)
+    except Interrupted:
+        return
+    raise RuntimeError(f"{folder}: the training was not interrupted")
+
+
+def tabulate(folder: str) -> None:
+    """Make `TABLES`, as the workflow does, in processes forked from this one."""
+    from tools import tables
+
+    os.chdir(ROOT)
+    tables.MADE = Path(folder)
+    tables.MADE.mkdir()
+    (tables.MADE / "runs").symlink_to(ROOT / "reference" / "runs")
+    study = {"configfiles": ["config/reference.yaml"], "config": [], "outputs": TABLES}
+    tables.make_all({"reference": study})
+
+
+if __name__ == "__main__":
+    for what, *task in json.loads(sys.argv[1]):
+        tabulate(*task) if what == "tables" else train(what, *task)
