@@ -123,7 +123,7 @@ def random_play(config: "RunConfig", steps: int) -> dict[str, float]:
         added += times[1] - times[0]
         played += actions.size
     bonus = Clock()
-    curiosity = CuriosityReward(again(config), seed=config.seed).appraisal.curiosity.curiosity
+    curiosity = CuriosityReward(again(config), seed=config.seed).appraisal.curiosity
     for name in ("bonus", "remember"):
         bonus.time(curiosity, name)
     for episode, returns in episodes:
