@@ -29,9 +29,9 @@ SECTIONS = {
 }
 BONUS = {
     "update: critics": "ppo.critics.intrinsic.learn",
-    "novelty: k-NN": "curiosity.novelty.distances curiosity.novelty._replace_redundant",
+    "novelty: k-NN": "curiosity.novelty.knn_novelty curiosity.novelty._replace_redundant",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.observe",
-    "memory": "curiosity.memory.lookup curiosity.memory.write",
+    "memory": "curiosity.memory.recall curiosity.memory.write",
     "meta network": "controller.next_episode adapt",
 }
 ALL_SECTIONS = list(SECTIONS | BONUS)

@@ -22,7 +22,7 @@ from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import Study, read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
-from mace_rl.runs.checkpoint import archive, unarchive
+from mace_rl.runs.checkpoint import archive
 from mace_rl.train import Trainer
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
@@ -136,29 +136,6 @@ def test_icm_by_autograd(actions):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
 
 
-def walk(seed, length=100) -> Episode:
-    """A place that actions 0 and 1 move, and four dimensions of noise that nothing can."""
-    episode = wander(seed, length=length)
-    episode.actions[:] = np.random.default_rng(seed).integers(2, size=length)
-    places = episode.observations[:, 0]
-    places[0] = 0
-    for t, action in enumerate(episode.actions):
-        places[t + 1] = np.clip(places[t] + action - 0.5, -2, 2)
-    return episode
-
-
-def test_icm_learns_the_actions_and_leaves_out_what_they_do_not_influence():
-    """Even a perfect forward model of the observations misses the noise, 4/5 of their variance."""
-    icm = make("icm", feature_units=8)
-    for seed in range(100):
-        icm.remember(walk(seed), np.zeros(100))
-    held_out = icm.inputs(walk(1000, 1000))
-    inverse, forward = icm.network.forward(held_out).outputs.mean(axis=0)
-    features = icm.network.module().features(torch.from_numpy(held_out[:, SIZE : 2 * SIZE]))
-    assert inverse < 0.2 * math.log(2)  # nats; guessing costs log 2
-    assert 2 * forward < 0.1 * features.detach().numpy().var(axis=0).sum()
-
-
 # --- Counts of hashes ---------------------------------------------------------------------------
 
 
@@ -186,18 +163,6 @@ def test_counts_are_those_of_sign_patterns():
     assert sum(hashed.counts.values()) == 300
 
 
-def test_states_at_a_small_angle_share_a_code():
-    """Each bit differs with probability angle / π (Charikar 2002)."""
-    hashes = [make("hash_counts", seed, bits=62) for seed in range(100)]
-    one, other = np.eye(SIZE)[:2]
-    for angle, fewest, most in ((0.02, 40, 90), (0.5, 0, 1), (2.0, 0, 0)):
-        pair = np.float32([one, math.cos(angle) * one + math.sin(angle) * other])
-        codes = [hashed.codes(pair) for hashed in hashes]
-        differing = sum((first ^ second).bit_count() for first, second in codes)
-        assert differing / 6200 == pytest.approx(angle / math.pi, abs=0.02)
-        assert fewest <= sum(first == second for first, second in codes) <= most
-
-
 def test_discrete_states_are_counted_one_by_one(with_bonus):
     trainer = finish(with_bonus({"kind": "hash_counts", "bits": 40}, "FrozenLake-v1", episodes=9))
     assert set(trainer.curiosity.codes(np.eye(16))) >= set(trainer.curiosity.counts)
@@ -207,19 +172,6 @@ def test_discrete_states_are_counted_one_by_one(with_bonus):
 
 
 # --- What all share -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", OTHERS)
-def test_restored_bonus_continues_to_the_bit(kind):
-    original, restored = make(kind), make(kind, seed=1)
-    for seed in range(3):
-        original.remember(wander(seed), np.zeros(50))
-    restored.load_state_dict(unarchive(archive(original.state_dict()), Path("memory")))
-    for seed in range(3, 6):
-        assert (original.bonus(wander(seed)).reward == restored.bonus(wander(seed)).reward).all()
-        original.remember(wander(seed), np.zeros(50))
-        restored.remember(wander(seed), np.zeros(50))
-    assert archive(original.state_dict()) == archive(restored.state_dict())
 
 
 @pytest.mark.parametrize("kind", OTHERS)
@@ -252,19 +204,6 @@ def test_beta_0_equals_ppo_to_the_bit(with_bonus, study, environment, bonus):
     returns = [[record.extrinsic_return for record in run.records] for run in (zero, plain)]
     assert returns[0] == returns[1] and plain.curiosity is None
     assert sum(record.intrinsic_return for record in zero.records) > 0.1
-
-
-def test_without_relevance_the_bonus_is_novelty(with_bonus, monkeypatch):
-    trainer = Trainer(with_bonus({"kind": "curiosity", "relevance": False}, episodes=20))
-    assert trainer.config.memory is None and trainer.config.novelty is not None
-    bonuses, appraise = [], trainer.appraise
-    monkeypatch.setattr(
-        trainer, "appraise", lambda e: (bonuses.append((item := appraise(e)).bonus), item)[1]
-    )
-    finish(trainer)
-    for bonus in bonuses:
-        assert (bonus.reward == bonus.novelty).all() and (bonus.relevance == 1).all()
-    assert len(bonuses) == 20 and min(bonus.reward.min() for bonus in bonuses) < 0.9
 
 
 class Fixed(IntrinsicReward):

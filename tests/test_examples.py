@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -75,7 +74,7 @@ def test_what_the_page_shows_works(tmp_path, monkeypatch):
     for block in blocks:
         exec(block, names)
         env = names["env"]
-        assert len(env.appraisal.curiosity.curiosity.memory) > 0  # the restored one's, too
+        assert len(env.appraisal.curiosity.memory) > 0  # the restored one's, too
     names["shared"].reset()
     assert names["shared"].step(np.arange(4))[1].shape == (4,)
     names["agent"].learn(1)
@@ -89,11 +88,5 @@ def test_several_environments_of_stable_baselines3_s():
     agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=128, n_epochs=1, device="cpu")
     agent.learn(512)
     assert all(episode["r"] == episode["l"] for episode in agent.ep_info_buffer)
-    first, second = (env.appraisal.curiosity.curiosity.memory for env in unwrapped(envs))
+    first, second = (env.appraisal.curiosity.memory for env in envs.envs)
     assert len(first) > 0 < len(second) and first is not second
-
-
-def unwrapped(envs) -> list[gymnasium.Env]:
-    """The curiosity wrappers, which are the outermost."""
-    assert all(isinstance(env, CuriosityReward) for env in envs.envs)
-    return envs.envs

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -13,7 +14,6 @@ from mace_rl.agent.advantages import generalised_advantages
 from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.bonus.stepwise import StepwiseCuriosity
 from mace_rl.config.beta import BanditBeta, CustomBeta
 from mace_rl.config.section import ConfigError, short
 from mace_rl.config.wrappers import CuriosityConfig
@@ -27,6 +27,39 @@ from mace_rl.streams import Streams
 PARTS = ("reward_extrinsic", "reward_curiosity", "curiosity", "novelty", "relevance", "beta")
 
 
+LISTS = ("observations", "actions", "rewards", "bonus")  # of a `Recording`, in this order
+
+
+@dataclass
+class Recording:
+    """An episode that goes on: what was played, what it was worth, and at which rates."""
+
+    beta: float
+    unit: float  # see `Appraisal.unit`
+    visits: np.ndarray  # to each Discrete state so far, [observation]; of Box ones 0
+    observations: list[np.ndarray]  # the first, and what each step led to, float32 [observation]
+    actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
+    rewards: list[float] = field(default_factory=list)  # extrinsic
+    bonus: list[float] = field(default_factory=list)  # R_curiosity
+
+    def episode(self, terminated: bool) -> Episode:
+        """The episode as it was played; how likely its actions were is not known here."""
+        unknown = np.full(len(self.rewards), np.nan, np.float32)
+        states, actions = np.stack(self.observations), np.array(self.actions)
+        return Episode(states, actions, unknown, np.array(self.rewards), terminated)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Each part as a tensor."""
+        return {name: torch.tensor(np.array(part)) for name, part in vars(self).items()}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Recording":
+        """The recording that `state_dict` was of."""
+        parts: dict[str, Any] = {name: part.numpy() for name, part in state.items()}
+        numbers = parts["beta"].item(), parts["unit"].item(), parts["visits"]
+        return cls(*numbers, *(list(parts[name]) for name in LISTS))
+
+
 class Appraisal:
     """Appraises episodes of several environments while they go on."""
 
@@ -35,8 +68,7 @@ class Appraisal:
         streams = Streams(config.seed)
         space, size = spaces.observation_space, spaces.observation_size
         memory = config.memory if config.relevance else None
-        curiosity = Curiosity(memory, config.novelty, "compiled", space, size, streams)
-        self.curiosity = StepwiseCuriosity(curiosity, environments)
+        self.curiosity = Curiosity(memory, config.novelty, "compiled", space, size, streams)
         self.controller = beta_rule(config.beta, config.rollout_steps, streams["beta"])
         if isinstance(config.beta, CustomBeta) and self.controller.learns:
             raise ConfigError(
@@ -48,79 +80,49 @@ class Appraisal:
                 "beta.kind is 'bandit', which learns from each episode before the next begins, but "
                 f"here {environments} go on at once: wrap each environment in a CuriosityReward"
             )
-        self.extrinsic_scale = RewardScale(config.discount, 1.0)
-        self.curiosity_scale = RewardScale(config.discount, TINY)
+        # Of the extrinsic rewards and of the curiosity bonus.
+        self.scales = RewardScale(config.discount, 1.0), RewardScale(config.discount, TINY)
         self.recordings: list[Recording | None] = [None] * environments
-        self.first_observation, self.first_action = (
-            int(space.start) if isinstance(space, Discrete) else None  # of the numbers
-            for space in (spaces.observation_space, spaces.action_space)
-        )
 
     @property
     def unit(self) -> float:
         """What 1 of R_curiosity is worth in extrinsic reward; 0 before any episode has ended."""
-        if self.extrinsic_scale.sums.count == 0:
-            return 0.0
-        return self.extrinsic_scale.value / self.curiosity_scale.value
-
-    def going_on(self) -> np.ndarray:
-        """Whether there is an unfinished episode, for each environment, bool [environments]."""
-        return np.array([recording is not None for recording in self.recordings])
+        extrinsic, curiosity = self.scales
+        return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
 
     def begin(self, environment: int, observation: Any) -> None:
         """An episode begins; what was played of another is forgotten."""
-        first = self.encode(observation)
-        beta = self.controller.beta
+        first, beta = np.array(self.spaces.encode(observation)), self.controller.beta
         require_share("β", beta)
-        self.recordings[environment] = Recording(first, beta, self.unit)
-        self.curiosity.begin(environment)
+        self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
     def pay(
         self, environment: int, action: Any, reward: float, observation: Any
     ) -> dict[str, float]:
         """`PARTS` of the reward for a step; reward: the extrinsic one; then what it led to."""
-        recording = self.recordings[environment]
+        recording, space = self.recordings[environment], self.spaces.action_space
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
         if not math.isfinite(reward):
-            require_finite("the reward", reward, f" after step {len(recording) + 1}")
-        state = recording.add(self.action(action), reward, self.encode(observation))
-        bonus, novelty, relevance = self.curiosity.bonus(state, environment)
+            require_finite("the reward", reward, f" after step {len(recording.rewards) + 1}")
+        state = np.array(self.spaces.encode(observation))  # a copy
+        found = self.curiosity.appraise(state[None], recording.visits)
+        bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
             require_share("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
             bonus = max(bonus, 0.0)
-        recording.bonus.append(bonus)
-        return {
-            "reward_extrinsic": reward,
-            "reward_curiosity": recording.beta * recording.unit * bonus,
-            "curiosity": bonus,
-            "novelty": novelty,
-            "relevance": relevance,
-            "beta": recording.beta,
-        }
-
-    def encode(self, observation: Any) -> np.ndarray:
-        """A float32 vector, [observation_size]; `ConfigError` for what is not of the space."""
-        spaces = self.spaces
-        if self.first_observation is None:
-            vector = np.asarray(observation, np.float32)
-            if vector.size == spaces.observation_size:
-                return vector.ravel()
-            found = f"shape {vector.shape}"
+        if self.spaces.discrete_observations:
+            recording.visits += state
+        if isinstance(space, Discrete):
+            recording.actions.append(int(action) - int(space.start))
         else:
-            if 0 <= int(observation) - self.first_observation < spaces.observation_size:
-                return spaces.encode(observation)
-            found = f"number {observation}"
-        raise ConfigError(
-            f"environment {spaces.name!r} gave an observation of {found}, but its "
-            f"observation_space is {spaces.observation_space}"
-        )
-
-    def action(self, action: Any) -> Any:
-        """As an `Episode` has it: an int from 0, or float32 [actions], a copy."""
-        if self.first_action is None:
-            return np.array(action, np.float32)
-        return int(action) - self.first_action
+            recording.actions.append(np.array(action, np.float32))  # a copy
+        recording.observations.append(state)
+        recording.rewards.append(reward)
+        recording.bonus.append(bonus)
+        paid = recording.beta * recording.unit * bonus
+        values = (reward, paid, bonus, novelty, relevance, recording.beta)
+        return dict(zip(PARTS, values, strict=True))
 
     def end(self, environment: int, terminated: bool) -> None:
         """The episode becomes memory, and β is set anew."""
@@ -129,8 +131,8 @@ class Appraisal:
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
         require_finite("an observation", episode.observations)
-        self.extrinsic_scale.update(episode.rewards)
-        self.curiosity_scale.update(bonus)
+        for scale, rewards in zip(self.scales, (episode.rewards, bonus), strict=True):
+            scale.update(rewards)
         values = np.zeros(len(episode) + 1)  # with λ = 1 only rewards are left: no critic
         returns = generalised_advantages(episode.rewards, values, self.config.discount, 1.0)
         self.curiosity.remember(episode, returns)
@@ -138,10 +140,13 @@ class Appraisal:
 
     def described(self) -> dict[str, Any]:
         """What a state has to agree in with the one who loads it."""
-        described = self.config.model_dump(exclude={"seed"})  # drawn already
-        described["observation_size"] = self.spaces.observation_size
-        described["observation_space"] = type(self.spaces.observation_space).__name__
-        return {**described, "environments": len(self.recordings)}
+        return {
+            **self.config.model_dump(exclude={"seed"}),  # drawn already
+            "observation_size": self.spaces.observation_size,
+            "observation_space": type(self.spaces.observation_space).__name__,
+            "environments": len(self.recordings),
+            "form": 2,  # of the state itself
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """See `CuriosityReward`."""
@@ -149,94 +154,25 @@ class Appraisal:
             "settings": self.described(),
             "curiosity": self.curiosity.state_dict(),
             "controller": self.controller.state_dict(),
-            "scales": [self.extrinsic_scale.state_dict(), self.curiosity_scale.state_dict()],
-            "recordings": [
-                None if recording is None else recording.state_dict()
-                for recording in self.recordings
-            ],
+            "scales": [scale.state_dict() for scale in self.scales],
+            "recordings": [None if one is None else one.state_dict() for one in self.recordings],
         }
         return copy.deepcopy(state)  # the training may go on before this is saved
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `CuriosityReward`."""
-        state, mine = copy.deepcopy(state), self.described()
-        if missing := mine.keys() - state["settings"]:
-            raise ConfigError(
-                f"the state to load has no setting {min(missing)}: another version saved it"
-            )
-        for name, value in state["settings"].items():
-            if name not in mine:
+        theirs, mine = state["settings"], self.described()
+        for name in sorted(theirs.keys() | mine.keys()):
+            if name not in theirs or name not in mine or theirs[name] != mine[name]:
+                then, now = (short(x[name]) if name in x else "unknown" for x in (theirs, mine))
                 raise ConfigError(
-                    f"the state to load was made with {name} {short(value)}, which is no setting "
-                    "here"
+                    f"the state to load was made with {name} {then}, but here it is {now}"
                 )
-            if value != mine[name]:
-                raise ConfigError(
-                    f"the state to load was made with {name} {short(value)}, but here it is "
-                    f"{short(mine[name])}"
-                )
+        state = copy.deepcopy(state)
         self.curiosity.load_state_dict(state["curiosity"])
         self.controller.load_state_dict(state["controller"])
-        for scale, saved in zip(
-            (self.extrinsic_scale, self.curiosity_scale), state["scales"], strict=True
-        ):
+        for scale, saved in zip(self.scales, state["scales"], strict=True):
             scale.load_state_dict(saved)
         self.recordings = [
             None if saved is None else Recording.from_state(saved) for saved in state["recordings"]
         ]
-
-
-class Recording:
-    """An episode that goes on: what was played, what it was worth, and at which rates."""
-
-    def __init__(self, first: np.ndarray, beta: float, unit: float) -> None:
-        self.beta, self.unit = beta, unit
-        self.observations = np.zeros((64, len(first)), np.float32)  # doubled as it gets full
-        self.observations[0] = first
-        self.actions: list[Any] = []
-        self.rewards: list[float] = []  # extrinsic
-        self.bonus: list[float] = []  # R_curiosity
-
-    def __len__(self) -> int:
-        return len(self.rewards)
-
-    def add(self, action: Any, reward: float, observation: np.ndarray) -> np.ndarray:
-        """One step and what it led to, all as in an `Episode`; returns the latter, as kept here."""
-        self.actions.append(action)
-        self.rewards.append(reward)
-        if len(self.rewards) == len(self.observations):
-            more = np.zeros_like(self.observations)
-            self.observations = np.concatenate([self.observations, more])
-        kept = self.observations[len(self.rewards)]
-        kept[:] = observation
-        return kept
-
-    def episode(self, terminated: bool) -> Episode:
-        """The episode as it was played; how likely its actions were is not known here."""
-        actions = np.array(self.actions)  # int64 or float32, as `Appraisal.action` has it
-        unknown = np.full(len(self), np.nan, np.float32)
-        observations = self.observations[: len(self) + 1]
-        return Episode(observations, actions, unknown, np.array(self.rewards), terminated)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `from_state` needs."""
-        episode = self.episode(terminated=False)
-        return {
-            "observations": torch.from_numpy(episode.observations),
-            "actions": torch.from_numpy(episode.actions),
-            "rewards": list(self.rewards),
-            "bonus": list(self.bonus),
-            "beta": self.beta,
-            "unit": self.unit,
-        }
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "Recording":
-        """The recording that `state_dict` was of."""
-        observations, actions = state["observations"].numpy(), state["actions"].numpy()
-        recording = cls(observations[0], state["beta"], state["unit"])
-        steps = zip(actions, state["rewards"], observations[1:], strict=True)
-        for action, reward, observation in steps:
-            recording.add(action, reward, observation)
-        recording.bonus = list(state["bonus"])
-        return recording

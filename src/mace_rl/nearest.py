@@ -8,24 +8,40 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
+class Neighbours:
+    """Points among which the nearest are searched for: laid out once, then asked for one or many.
+
+    points: float32 [M, size], finite; mean, std: [size]. Distances are Euclidean between
+    (x - mean) / std of query and point. `mean` cancels but for rounding, which is least if it is
+    near the points.
+    """
+
+    def __init__(self, points: np.ndarray, mean: np.ndarray, std: np.ndarray) -> None:
+        self.mean, self.std = mean.astype(np.float32), std.astype(np.float32)
+        self.columns = in_columns(points, self.mean, self.std)
+
+    def __len__(self) -> int:
+        return self.columns.shape[1]
+
+    def nearest(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The `count` ≤ M nearest points to each query, nearest first, in units of `std`.
+
+        queries: float32 [N, size]. Returns squared distances, float32 [N, count], and the points'
+        indices, int64 [N, count]; of equally distant points the first come first.
+        """
+        return nearest_in_columns(queries, self.columns, self.mean, self.std, count)
+
+
 def nearest(
     queries: np.ndarray, points: np.ndarray, mean: np.ndarray, std: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` nearest points to each query, nearest first, in units of `std`.
-
-    queries: float32 [N, size]; points: float32 [M, size], finite, M ≥ count; mean, std: float32
-    [size]. Distances are Euclidean between (x - mean) / std of query and point. `mean` cancels but
-    for rounding, which is least if it is near the points. Returns squared distances, float32
-    [N, count], and the points' indices, int64 [N, count]; of equally distant points the first in
-    `points` come first.
-    """
-    return nearest_in_columns(queries, in_columns(points, mean, std), mean, std, count)
+    """`Neighbours.nearest` for points that are searched once."""
+    return Neighbours(points, mean, std).nearest(queries, count)
 
 
 @njit(cache=True, error_model="numpy")
 def in_columns(points: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """`points` as `nearest_in_columns` takes them, for searches among the same ones, float32."""
+    """`points` as `nearest_in_columns` takes them, float32."""
     # Points on columns, so that inner loops run along contiguous memory; dimensions four at a time,
     # to load and store the sums less often, filled up with zeros.
     total, size = points.shape
@@ -41,7 +57,7 @@ def in_columns(points: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndar
 def nearest_in_columns(
     queries: np.ndarray, columns: np.ndarray, mean: np.ndarray, std: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`nearest` of the points that `in_columns` was given, with the same `mean` and `std`."""
+    """See `Neighbours`; columns: the points as `in_columns` lays them out, for `mean` and `std`."""
     padded, total = columns.shape
     rows = np.zeros((len(queries), padded), np.float32)
     for i in range(len(mean)):

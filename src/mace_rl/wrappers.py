@@ -31,7 +31,50 @@ from mace_rl.environments.spaces import Spaces
 Settings = Mapping[str, Any]
 
 
-class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class Curious(RecordConstructorArgs):
+    """What both wrappers have; `CuriosityReward` says what the arguments mean."""
+
+    def __init__(
+        self,
+        env: Any,
+        beta: float | Settings = 0.4,
+        *,
+        relevance: bool = True,
+        memory: Settings | None = None,
+        novelty: Settings | None = None,
+        discount: float = 0.99,
+        rollout_steps: int = 1,
+        seed: int = 0,
+    ) -> None:
+        settings = given(locals())
+        RecordConstructorArgs.__init__(self, **settings)  # for `spec`, from which it can be remade
+        super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]  # Gymnasium's
+        config = check(CuriosityConfig, settings, type(self).__name__)
+        count, spaces = 1, (env.observation_space, env.action_space)
+        if isinstance(env, VectorEnv):
+            count, spaces = env.num_envs, (env.single_observation_space, env.single_action_space)
+            self.mode = env.metadata.get("autoreset_mode")
+            if not isinstance(self.mode, AutoresetMode):
+                raise ConfigError(
+                    f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
+                    " but it should be one of gymnasium.vector.AutoresetMode"
+                )
+        self.appraisal = Appraisal(config, Spaces(name_of(env), *spaces), count)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the rest of a training depends on here, unfinished episode included.
+
+        Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
+        `weights_only`. The environment's and the agent's state are not in it.
+        """
+        return self.appraisal.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned; `ConfigError` if other settings made it."""
+        self.appraisal.load_state_dict(state)
+
+
+class CuriosityReward(Curious, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
     env: observations are arrays of one shape (Box; they are flattened) or Discrete, actions are
@@ -58,32 +101,6 @@ class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     is not a number.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        beta: float | Settings = 0.4,
-        *,
-        relevance: bool = True,
-        memory: Settings | None = None,
-        novelty: Settings | None = None,
-        discount: float = 0.99,
-        rollout_steps: int = 1,
-        seed: int = 0,
-    ) -> None:
-        settings = {
-            "beta": beta,
-            "relevance": relevance,
-            "discount": discount,
-            "rollout_steps": rollout_steps,
-            "seed": seed,
-            **given(memory=memory, novelty=novelty),
-        }
-        RecordConstructorArgs.__init__(self, **settings)  # for `spec`, from which it can be remade
-        gymnasium.Wrapper.__init__(self, env)
-        config = check(CuriosityConfig, settings, type(self).__name__)
-        spaces = Spaces(name_of(env), env.observation_space, env.action_space)
-        self.appraisal = Appraisal(config, spaces, 1)
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -101,20 +118,8 @@ class CuriosityReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         total = parts["reward_extrinsic"] + parts["reward_curiosity"]
         return observation, total, terminated, truncated, {**info, **parts}
 
-    def state_dict(self) -> dict[str, Any]:
-        """All that the rest of a training depends on here, unfinished episode included.
 
-        Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
-        `weights_only`. The environment's and the agent's state are not in it.
-        """
-        return self.appraisal.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned; `ConfigError` if other settings made it."""
-        self.appraisal.load_state_dict(state)
-
-
-class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     """`CuriosityReward` for environments that are stepped together and share what is known.
 
     What was seen in one of them is known in all as soon as its episode has ended. Arguments are
@@ -122,37 +127,6 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
     Gymnasium's masks: nothing is paid where an environment was only reset. All modes of autoreset
     work. Of a step that ended an episode, what was paid stands in `infos`, not in `final_info`.
     """
-
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        beta: float | Settings = 0.4,
-        *,
-        relevance: bool = True,
-        memory: Settings | None = None,
-        novelty: Settings | None = None,
-        discount: float = 0.99,
-        rollout_steps: int = 1,
-        seed: int = 0,
-    ) -> None:
-        settings = {
-            "beta": beta,
-            "relevance": relevance,
-            "discount": discount,
-            "rollout_steps": rollout_steps,
-            "seed": seed,
-            **given(memory=memory, novelty=novelty),
-        }
-        super().__init__(env)
-        self.mode = env.metadata.get("autoreset_mode")
-        if not isinstance(self.mode, AutoresetMode):
-            raise ConfigError(
-                f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'], "
-                "but it should be one of gymnasium.vector.AutoresetMode"
-            )
-        config = check(CuriosityConfig, settings, type(self).__name__)
-        spaces = Spaces(name_of(env), env.single_observation_space, env.single_action_space)
-        self.appraisal = Appraisal(config, spaces, self.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -172,35 +146,26 @@ class VectorCuriosityReward(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
             final = infos["final_obs"]
             reached = [final[i] if ended[i] else observations[i] for i in range(self.num_envs)]
-        fresh = np.zeros(self.num_envs, np.bool_)
-        if self.mode is AutoresetMode.NEXT_STEP:
-            fresh = ~self.appraisal.going_on()
-        played = [i for i, new in enumerate(fresh.tolist()) if not new]
-        paid = [self.appraisal.pay(i, actions[i], float(rewards[i]), reached[i]) for i in played]
+        over = np.array([recording is None for recording in self.appraisal.recordings])
+        fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
+        values = np.zeros((len(PARTS), self.num_envs))
+        for i in np.flatnonzero(~fresh).tolist():
+            parts = self.appraisal.pay(i, actions[i], float(rewards[i]), reached[i])
+            values[:, i] = list(parts.values())
         for i in np.flatnonzero(ended).tolist():
             self.appraisal.end(i, bool(terminated[i]))
         for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
             self.appraisal.begin(i, observations[i])
-        values = np.zeros((len(PARTS), self.num_envs))
-        for i, parts in zip(played, paid, strict=True):
-            values[:, i] = [parts[name] for name in PARTS]
         total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
         told = dict(zip(PARTS, values, strict=True))
         masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)
         return observations, total, terminated, truncated, {**infos, **told, **masks}
 
-    def state_dict(self) -> dict[str, Any]:
-        """See `CuriosityReward`."""
-        return self.appraisal.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `CuriosityReward`."""
-        self.appraisal.load_state_dict(state)
-
-
-def given(**settings: Any) -> dict[str, Any]:
-    """Those that are not None."""
-    return {name: value for name, value in settings.items() if value is not None}
+def given(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The settings among a constructor's arguments; of memory and novelty None is none."""
+    omitted = [name for name in ("memory", "novelty") if arguments[name] is None]
+    return {name: arguments[name] for name in CuriosityConfig.model_fields if name not in omitted}
 
 
 def name_of(env: Any) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
+from numba import njit
 
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
@@ -17,21 +18,30 @@ from mace_rl.streams import Streams
 SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
 
 
+@njit(cache=True, error_model="numpy")
 def relevance(
     similarity: np.ndarray, recalled: np.ndarray, worst: float, best: float
 ) -> np.ndarray:
     """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
 
-    similarity: [N]; recalled: remembered return-to-go, [N]. Productivity is how far the recalled
-    return lies on the way from the `worst` to the `best` return that memory holds, in [0, 1]; 0
-    where none is better than another. So a state unlike anything remembered has relevance 1, one
-    like unproductive states goes toward 0, and one like productive states stays near 1.
+    similarity, recalled: float32 [N], the latter the remembered return-to-go. Productivity is how
+    far the recalled return lies on the way from the `worst` to the `best` return that memory holds,
+    in [0, 1]; 0 where none is better than another. So a state unlike anything remembered has
+    relevance 1, one like unproductive states goes toward 0, and one like productive states stays
+    near 1.
     """
     span = best - worst
-    if not span > SMALLEST_SPAN:
-        return 1.0 - similarity
-    productivity = np.clip((recalled - worst) / span, 0, 1)
-    return 1 - similarity * (1 - productivity)
+    result = np.empty(len(similarity))
+    for n in range(len(similarity)):
+        productivity = np.float32(0)
+        if span > SMALLEST_SPAN:
+            productivity = (recalled[n] - np.float32(worst)) / np.float32(span)
+            if productivity < 0:  # so written, NaN stays NaN
+                productivity = np.float32(0)
+            elif productivity > 1:
+                productivity = np.float32(1)
+        result[n] = 1 - np.float64(similarity[n]) * np.float64(np.float32(1) - productivity)
+    return result
 
 
 class Curiosity(IntrinsicReward):
@@ -61,21 +71,20 @@ class Curiosity(IntrinsicReward):
 
     def bonus(self, episode: Episode) -> Bonus:
         """R_curiosity of each step: novelty × relevance of the state it led to."""
-        states = episode.observations[1:]
-        new = self.novelty(states)
+        return self.appraise(episode.observations[1:])
+
+    def appraise(self, states: np.ndarray, visits: np.ndarray | None = None) -> Bonus:
+        """The bonus for states that an episode came to one after the other.
+
+        states: float32 [N, observation]; visits: see `Novelty.continued`, if it goes on.
+        """
+        new = self.novelty(states) if visits is None else self.novelty.continued(states, visits)
         if self.memory is None:
             return Bonus(new, new, np.ones(len(new)))
-        if len(self.memory) == 0:
+        if self.memory.neighbours is None:
             return Bonus(new, new, np.ones(len(new)), np.zeros(len(new)))
-        recollection = self.memory.lookup(
-            torch.from_numpy(states),
-            torch.from_numpy(self.normaliser.mean.astype(np.float32)),
-            torch.from_numpy(self.scale().astype(np.float32)),
-        )
-        similarity, recalled = recollection.similarity.numpy(), recollection.values[:, -1].numpy()
-        remembered = self.memory.values[: len(self.memory), -1].numpy()
-        worst, best = float(remembered.min()), float(remembered.max())
-        relevant = relevance(similarity.astype(np.float64), recalled, worst, best)
+        recalled, similarity = self.memory.recall(states)
+        relevant = relevance(similarity, recalled[:, -1], self.worst, self.best)
         return Bonus(new * relevant, new, relevant, similarity)
 
     def scale(self) -> np.ndarray:
@@ -97,6 +106,14 @@ class Curiosity(IntrinsicReward):
         if not self.discrete:
             self.normaliser.update(episode.observations[1:])
         self.novelty.observe(episode.observations[1:])
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        # What the memory compares states with until the next episode is remembered.
+        if self.memory is not None and len(self.memory) > 0:
+            self.memory.lay_out(self.normaliser.mean, self.scale())
+            returns = self.memory.values[: len(self.memory), -1].numpy()
+            self.worst, self.best = float(returns.min()), float(returns.max())
 
     def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.
@@ -127,3 +144,4 @@ class Curiosity(IntrinsicReward):
         self.steps = state["steps"]
         self.normaliser.load_state_dict(state["normaliser"])
         self.novelty.load_state_dict(state["novelty"])
+        self._lay_out()

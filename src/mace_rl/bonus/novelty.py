@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
+from numba import njit
 
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
@@ -14,7 +15,7 @@ from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.config.plugins import make
 from mace_rl.config.section import ConfigError
 from mace_rl.finite import require_finite
-from mace_rl.nearest import nearest
+from mace_rl.nearest import Neighbours, nearest
 from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
@@ -30,6 +31,13 @@ class Novelty(ABC):
     @abstractmethod
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """Novelty of each state, [T, observation] → float64 [T] in [0, 1]."""
+
+    def continued(self, states: np.ndarray, visits: np.ndarray) -> np.ndarray:
+        """The same when the episode came to others before.
+
+        visits: how often to each of the Discrete ones, [observation]; of Box ones 0.
+        """
+        return self(states)
 
     @abstractmethod
     def observe(self, states: np.ndarray) -> None:
@@ -83,7 +91,11 @@ class CountNovelty(Novelty):
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """See `Novelty`; states are one-hot."""
-        counts = self.counts.copy()
+        return self.continued(states, np.zeros_like(self.counts))
+
+    def continued(self, states: np.ndarray, visits: np.ndarray) -> np.ndarray:
+        """See `Novelty`."""
+        counts = self.counts + visits
         novelty = np.empty(len(states))
         for t, state in enumerate(states.argmax(axis=1)):
             counts[state] += 1
@@ -107,10 +119,11 @@ class DensityNovelty(Novelty):
     """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
 
     Both refer to a buffer that covers the visited states, as `normaliser` sees them, whose owner
-    keeps it up to date: once it is full, a state that is far from it takes the place of one that is
-    close to another. Both are measured against what is usual there: after each episode a sample of
-    visited states says how far a known state is from its neighbours, and how likely. A state no
-    farther and no less likely than `KNOWN` of them has novelty 0.
+    brings it up to date before each `observe` and `load_state_dict`: once it is full, a state that
+    is far from it takes the place of one that is close to another. Both are measured against what
+    is usual there: after each episode a sample of visited states says how far a known state is from
+    its neighbours, and how likely. A state no farther and no less likely than `KNOWN` of them has
+    novelty 0.
 
     - k-NN: 1 - d*/d, with d the mean distance to the k nearest visited states and d* what is usual;
       the mean over the ensemble's ks.
@@ -138,45 +151,38 @@ class DensityNovelty(Novelty):
         self.batches = streams["density_batches"]
         self.usual_distances = np.zeros(len(config.neighbours))
         self.usual_log_density = 0.0
+        self.ensemble = np.array(config.neighbours)
+        self.largest = max(config.neighbours)
+        self._lay_out()
 
     @property
     def visited(self) -> np.ndarray:
         """The states in the buffer, [n, observation]."""
         return self.buffer[: min(self.seen, len(self.buffer))]
 
-    @property
-    def dimensions(self) -> int:
-        """How many dimensions of the observation have varied, at least 1."""
-        return max(1, int(self.normaliser.varied.sum()))
+    def _lay_out(self) -> None:
+        """Prepare what states are compared with until the next ones are observed."""
+        self.mean, self.std = self.normaliser.mean, self.normaliser.std
+        self.dimensions = max(1, int(self.normaliser.varied.sum()))  # of the observation, that vary
+        self.neighbours = Neighbours(self.visited, self.mean, self.std)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """See `Novelty`. 1 everywhere until the buffer has more states than the largest k."""
-        if self.seen <= max(self.config.neighbours):
+        if self.seen <= self.largest:
             return np.ones(len(states))
         weight = self.config.knn_weight
         return weight * self.knn_novelty(states) + (1 - weight) * self.density_novelty(states)
 
-    def distances(self, states: np.ndarray, skip: int = 0) -> np.ndarray:
-        """Mean distances to the k nearest visited states but the `skip` first, [T, ensemble]."""
-        visited, normaliser = self.visited, self.normaliser
-        largest = min(max(self.config.neighbours) + skip, len(visited))
-        mean, std = normaliser.mean.astype(np.float32), normaliser.std.astype(np.float32)
-        squared_distances, _ = nearest(states, visited, mean, std, largest)
-        distances = np.sqrt(squared_distances[:, skip:], dtype=np.float64)
-        neighbours = np.minimum(self.config.neighbours, largest - skip)
-        return distances.cumsum(axis=1)[:, neighbours - 1] / neighbours
-
     def knn_novelty(self, states: np.ndarray) -> np.ndarray:
         """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
-        distances, usual = self.distances(states), self.usual_distances
-        # Where states repeat exactly both are 0, and what is known is still not new.
-        share = np.divide(usual, distances, out=np.ones_like(distances), where=distances > usual)
-        return (1 - share).mean(axis=1)
+        squared_distances, _ = self.neighbours.nearest(states, self.largest)
+        beyond = share_beyond(squared_distances, self.ensemble, self.usual_distances)
+        return np.add.reduce(beyond, axis=1) / len(self.ensemble)
 
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
-        lack = self.usual_log_density - self.density.log_prob(self.normaliser(states))
-        return 1 - np.exp(-np.maximum(lack.astype(np.float64), 0) / self.dimensions)
+        log_probs = self.density.log_prob(standardised(states, self.mean, self.std))
+        return 1 - np.exp(-lack(log_probs, self.usual_log_density) / self.dimensions)
 
     def observe(self, states: np.ndarray) -> None:
         """Add one in `write_every` of an episode's states and train the density estimator."""
@@ -187,8 +193,9 @@ class DensityNovelty(Novelty):
         self.seen += len(chosen[:free])
         if len(chosen) > free:
             self._replace_redundant(chosen[free:])
+        self._lay_out()
         visited = self.visited
-        if len(visited) <= max(self.config.neighbours):
+        if len(visited) <= self.largest:
             return
         shape = self.config.density_steps, self.config.density_batch_size
         samples = visited[self.batches.integers(len(visited), size=shape)]
@@ -197,8 +204,10 @@ class DensityNovelty(Novelty):
         log_probs = self.density.log_prob(self.normaliser(samples[-1]))
         require_finite("a log-density", log_probs)
         self.usual_log_density = float(np.quantile(log_probs, 1 - KNOWN))
-        known = samples[-1][: self.config.calibration_states]  # a visited state's nearest is itself
-        self.usual_distances = np.quantile(self.distances(known, skip=1), KNOWN, axis=0)
+        known = samples[-1][: self.config.calibration_states]
+        squared_distances, _ = self.neighbours.nearest(known, self.largest + 1)
+        distances = mean_distances(squared_distances[:, 1:], self.ensemble)  # the nearest is itself
+        self.usual_distances = np.quantile(distances, KNOWN, axis=0)
 
     def _replace_redundant(self, states: np.ndarray) -> None:
         """Let states that are far from the buffer take the places of entries close to others.
@@ -208,12 +217,12 @@ class DensityNovelty(Novelty):
         a state is not put in beside its like, and an entry of whose neighbours one has just gone
         is not redundant any more.
         """
-        mean = self.normaliser.mean.astype(np.float32)
-        std = self.normaliser.std.astype(np.float32)
+        mean, std = self.normaliser.mean, self.normaliser.std
+        buffer = Neighbours(self.buffer, mean, std)
         sample = self.batches.integers(len(self.buffer), size=self.config.calibration_states)
-        sample, k = np.unique(sample), max(self.config.neighbours)
-        apart = nearest(states, self.buffer, mean, std, k)[0][:, -1]
-        squared, neighbours = nearest(self.buffer[sample], self.buffer, mean, std, k + 1)
+        sample, k = np.unique(sample), self.largest
+        apart = buffer.nearest(states, k)[0][:, -1]
+        squared, neighbours = buffer.nearest(self.buffer[sample], k + 1)
         gone: set[int] = set()
         for old in np.argsort(squared[:, -1]):
             new = int(np.argmax(apart))
@@ -245,3 +254,61 @@ class DensityNovelty(Novelty):
         self.batches.bit_generator.state = state["batches"]
         self.usual_distances = state["usual_distances"].numpy().copy()
         self.usual_log_density = state["usual_log_density"]
+        self._lay_out()
+
+
+# Compiled: for a single state NumPy's calls take longer than the search for its neighbours.
+
+
+@njit(cache=True, error_model="numpy")
+def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Mean distance to the k nearest, for each k of `neighbours`, float64 [T, ensemble].
+
+    squared_distances: float32 [T, at least the largest k], nearest first.
+    """
+    distances = np.empty((len(squared_distances), len(neighbours)))
+    sums = np.empty(squared_distances.shape[1])
+    for t in range(len(squared_distances)):
+        total = 0.0
+        for place in range(len(sums)):
+            total += np.sqrt(np.float64(squared_distances[t, place]))
+            sums[place] = total
+        for i in range(len(neighbours)):
+            distances[t, i] = sums[neighbours[i] - 1] / neighbours[i]
+    return distances
+
+
+@njit(cache=True, error_model="numpy")
+def share_beyond(
+    squared_distances: np.ndarray, neighbours: np.ndarray, usual: np.ndarray
+) -> np.ndarray:
+    """1 - d*/d of `mean_distances` d beyond the `usual` d*, [ensemble]; else 0: [T, ensemble].
+
+    Where states repeat exactly both are 0, and what is known is still not new.
+    """
+    shares = mean_distances(squared_distances, neighbours)
+    for share in shares:
+        for i in range(len(usual)):
+            share[i] = 1 - usual[i] / share[i] if share[i] > usual[i] else 0.0
+    return shares
+
+
+@njit(cache=True, error_model="numpy")
+def standardised(states: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """(states - mean) / std in float64, as float32 [T, size]."""
+    result = np.empty(states.shape, np.float32)
+    for t in range(len(states)):
+        for i in range(len(mean)):
+            result[t, i] = (states[t, i] - mean[i]) / std[i]
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def lack(log_probs: np.ndarray, usual: float) -> np.ndarray:
+    """How far log-densities, float32 [T], are below the `usual` one, float64; 0 if they are not."""
+    result = np.zeros(len(log_probs))
+    for t in range(len(log_probs)):
+        below = np.float32(usual) - log_probs[t]
+        if not below < 0:  # so written, NaN stays NaN
+            result[t] = below
+    return result

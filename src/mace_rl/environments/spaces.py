@@ -40,12 +40,26 @@ class Spaces:
         )
 
     def encode(self, observation: Any) -> np.ndarray:
-        """`observation` as a float32 vector, [observation_size]; may be the same memory."""
-        if isinstance(self.observation_space, Discrete):
-            vector = np.zeros(self.observation_size, np.float32)
-            vector[int(observation) - int(self.observation_space.start)] = 1.0
-            return vector
-        return np.asarray(observation, np.float32).ravel()
+        """`observation` as a float32 vector, [observation_size]; may be the same memory.
+
+        Raises `ConfigError` for what is not of the space.
+        """
+        space = self.observation_space
+        if isinstance(space, Discrete):
+            number, found = int(observation) - int(space.start), f"number {observation}"
+            if 0 <= number < self.observation_size:
+                vector = np.zeros(self.observation_size, np.float32)
+                vector[number] = 1.0
+                return vector
+        else:
+            vector = np.asarray(observation, np.float32)
+            if vector.size == self.observation_size:
+                return vector.ravel()
+            found = f"shape {vector.shape}"
+        raise ConfigError(
+            f"environment {self.name!r} gave an observation of {found}, but its "
+            f"observation_space is {space}"
+        )
 
 
 def _is_image(space: gymnasium.Space[Any]) -> bool:
