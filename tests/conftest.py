@@ -17,7 +17,6 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import mace_rl  # noqa: F401  isort: skip  (arithmetic is chosen before NumPy is imported)
 
 import gymnasium
-import numpy as np
 import pytest
 
 from mace_rl.config.reading import merge_layers
@@ -52,6 +51,27 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
     ) -> RunConfig:
         settings = study.run_config(environment, variant, seed).settings()
         return check(RunConfig, merge_layers(settings, changes), "the test")
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def trained(run_config, tmp_path_factory) -> Callable[..., Path]:
+    """`trained(environment, variant, seed, **changes)`: the folder of a finished run.
+
+    Each is made once and shared: copy it before changing anything in it.
+    """
+    from mace_rl.runs import run
+
+    folder, made = tmp_path_factory.mktemp("trained"), {}
+
+    def make(*names: Any, **changes: Any) -> Path:
+        config = run_config(*names, **changes)
+        key = config.model_dump_json()
+        if key not in made:
+            made[key] = folder / str(len(made)) / config.environment / config.variant
+            run.run(config, made[key])
+        return made[key]
 
     return make
 
@@ -161,19 +181,3 @@ def interrupted(run_config, tmp_path, kill, checkpoint_every, monkeypatch):
     checkpoint_every(1)
     kill(5, config, tmp_path / "run")
     return SimpleNamespace(config=config, directory=tmp_path / "run")
-
-
-@pytest.fixture
-def learned(monkeypatch) -> list[np.ndarray]:
-    """The gradients that reach optimisers, as they come."""
-    from mace_rl.agent.adam import Adam
-
-    gradients = []
-    step = Adam.step
-
-    def note(self: Adam, gradient: np.ndarray) -> float:
-        gradients.append(gradient.copy())
-        return step(self, gradient)
-
-    monkeypatch.setattr(Adam, "step", note)
-    return gradients

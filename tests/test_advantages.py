@@ -1,21 +1,16 @@
-"""PPO's advantages from their definition, the scales of rewards, and normalised observations."""
+"""Advantages and the scales of rewards: from their definitions, and what the scales are for."""
 
 import math
 
+import gymnasium
 import numpy as np
 import pytest
-from shared import Twin
+from gymnasium.wrappers import TransformReward
+from shared import Bonanza, Twin, finish
 
 from mace_rl.agent.advantages import generalised_advantages
-from mace_rl.agent.ppo import PPO
-
-
-def test_advantages_by_hand():
-    # γ = λ = ½. δ: 1 + ½·1 − 1 = ½, 2 + ½·1 − 1 = 1½, 3 + ½·4 − 1 = 4; each earlier one adds a
-    # quarter of the advantage that follows: 4, 1½ + 4/4 = 2½, ½ + 2½/4 = 1⅛.
-    rewards, values = np.array([1.0, 2.0, 3.0]), np.array([1.0, 1.0, 1.0, 4.0])
-    found = generalised_advantages(rewards, values, 0.5, 0.5)
-    assert found.tolist() == [1.125, 2.5, 4.0]
+from mace_rl.agent.scale import AdvantageScale, RewardScale
+from mace_rl.bonus.curiosity import Curiosity
 
 
 @pytest.mark.parametrize("gae_lambda", [0.0, 0.3, 0.95, 1.0])
@@ -49,7 +44,8 @@ def test_truncation_bootstraps_and_termination_never(
     make_ppo, kind, gae_lambda, terminated, scaled
 ):
     """Of rewards as they are, or over the deviation of their discounted sums, these included."""
-    ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda, scale_rewards=scaled)
+    settings = {"scale_rewards": scaled, "scale_advantages": scaled}
+    ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda, **settings)
     rng = np.random.default_rng(2)
     observations, paid = rng.standard_normal((6, 4)).astype(np.float32), 3 * rng.random(5)
     sums = [sum(0.99 ** (t - i) * paid[i] for i in range(t + 1)) for t in range(5)]
@@ -58,6 +54,7 @@ def test_truncation_bootstraps_and_termination_never(
     worth = 0.0 if terminated else values[5]
     assert abs(values[5]) > 0.05
     found, returns = ppo.advantages_and_returns(kind, observations, paid, terminated)
+    assert (ppo.advantage_scale(kind) == 1) != scaled
     # Backwards, the λ-return is r + γ ((1 − λ) V(s') + λ the next λ-return).
     following = worth
     for t in range(4, -1, -1):
@@ -67,53 +64,93 @@ def test_truncation_bootstraps_and_termination_never(
         assert found[t] == pytest.approx(following - values[t], abs=1e-5)
 
 
-def silenced(ppo: PPO) -> PPO:
-    """With critics that say 0, so that with λ = 1 advantages are discounted sums."""
-    for critic in ppo.critics.values():
-        critic.network.parameters[:] = 0
-    return ppo
+# --- Scales -------------------------------------------------------------------------------------
 
 
-def test_advantages_without_scales_are_the_plain_ones(make_ppo):
-    """γ = ½, λ = 1: 8; 4 + ½ 8 = 8; 2 + ½ 8 = 6; whatever came before."""
-    plain = {"scale_rewards": False, "scale_advantages": False, "gae_lambda": 1.0, "discount": 0.5}
-    ppo = silenced(make_ppo(intrinsic=True, **plain))
-    for kind in ("extrinsic", "intrinsic"):
-        for unit in (1, 1000, 0.001):
-            rewards = unit * np.array([2.0, 4.0, 8.0])
-            advantages, returns = ppo.advantages_and_returns(kind, np.zeros((4, 4)), rewards, True)
-            assert advantages.tolist() == returns.tolist() == [6 * unit, 8 * unit, 8 * unit]
-            assert ppo.advantage_scale(kind) == 1.0
+def episodes() -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [0.7 + rng.standard_normal(length) for length in (1, 7, 2, 30, 1, 12)]
 
 
-def test_scales_of_several_episodes_by_hand(make_ppo):
-    """γ = 0, so that a step's discounted sum and advantage are its reward."""
-    ppo = silenced(make_ppo(intrinsic=True, discount=0.0))
-    # The rewards' deviation so far; of all advantages so far, each over its own, the mean square.
-    for rewards, deviation, square in (
-        ([4.0, -4.0], 4.0, 1.0),  # ±1
-        ([0.0, 0.0], math.sqrt(8), 0.5),  # 0
-        ([8.0, -8.0], math.sqrt(160 / 6), (1 + 1 + 2 * 64 * 6 / 160) / 6),
-    ):
-        for kind in ("extrinsic", "intrinsic"):
-            found, _ = ppo.advantages_and_returns(kind, np.zeros((3, 4)), np.array(rewards), True)
-            np.testing.assert_allclose(found, np.array(rewards) / deviation)
-            assert ppo.advantage_scale(kind) == pytest.approx(math.sqrt(square))
+@pytest.mark.parametrize("smallest", [1e-8, 3.0])
+@pytest.mark.parametrize("discount", [0.0, 0.5, 0.99, 1.0])
+def test_reward_scale_is_the_deviation_of_discounted_sums_or_smallest(discount, smallest):
+    scale, sums = RewardScale(discount, smallest), []
+    assert scale.value == max(1.0, smallest)  # nothing seen yet
+    for rewards in episodes():
+        scale.update(rewards)
+        sums += [
+            sum(discount ** (t - i) * rewards[i] for i in range(t + 1)) for t in range(len(rewards))
+        ]
+        if len(sums) > 1:
+            assert scale.value == pytest.approx(max(np.std(sums), smallest), rel=1e-9)
+    constant = RewardScale(0.0, 1e-8)
+    constant.update(np.ones(30))
+    assert constant.value > 0.1  # rewards that have not varied are not blown up
 
 
-def test_tiny_costs_are_not_blown_up(make_ppo):
-    """Extrinsic rewards are over at least 1, their advantages over at least 0.1."""
-    ppo, rewards = silenced(make_ppo(intrinsic=True, discount=0.0)), np.array([-0.003, 0.001])
-    extrinsic, intrinsic = (
-        ppo.advantages_and_returns(kind, np.zeros((3, 4)), rewards, True)[0]
-        / ppo.advantage_scale(kind)
-        for kind in ("extrinsic", "intrinsic")
-    )
-    np.testing.assert_allclose(extrinsic, [-0.03, 0.01])
-    np.testing.assert_allclose(intrinsic, np.array([-3, 1]) / math.sqrt(5))
+def test_advantage_scale_is_the_root_mean_square_of_all_so_far_or_smallest():
+    scale, seen = AdvantageScale(0.1), []
+    assert scale.value == 0.1
+    for advantages in [*episodes(), np.zeros(10**6)]:
+        scale.update(advantages)
+        seen += advantages.tolist()
+        mean_square = math.sqrt(sum(x * x for x in seen) / len(seen))
+        assert scale.value == pytest.approx(max(mean_square, 0.1))
+    assert scale.value == 0.1
 
 
-# --- Normalisation ------------------------------------------------------------------------------
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(
+    ("kind", "smallest", "least"), [("extrinsic", 1.0, 0.1), ("intrinsic", 0.0, 0.0)]
+)
+def test_scales_of_several_episodes(make_ppo, kind, smallest, least, unit):
+    """γ = 0 and critics that say 0: a step's discounted sum and advantage are its reward.
+
+    Tiny extrinsic rewards are not blown up: they are over at least 1, their advantages over 0.1.
+    """
+    ppo, paid, seen = make_ppo(intrinsic=True, discount=0.0), [], []
+    ppo.critics[kind].network.parameters[:] = 0
+    for rewards in unit * np.array([[4.0, -4.0], [0.0, 0.0], [8.0, -8.0]]):
+        paid += rewards.tolist()
+        expected = rewards / max(np.std(paid), smallest)
+        found, _ = ppo.advantages_and_returns(kind, np.zeros((3, 4)), rewards, True)
+        np.testing.assert_allclose(found, expected)
+        seen += expected.tolist()
+        mean_square = np.mean(np.square(seen))
+        assert ppo.advantage_scale(kind) == pytest.approx(max(math.sqrt(mean_square), least))
+
+
+# --- β as a relative strength -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("reward", "bonus"), [(128.0, 1.0), (64.0, 2.0**-10)])
+def test_units_do_not_matter(run_config, register, monkeypatch, reward, bonus):
+    """To the bit, as a power of two rounds nothing; unscaled they do matter."""
+    curiosity = Curiosity.bonus
+
+    def learned(reward: float, bonus: float, scaled: bool) -> dict[str, bytes]:
+        def paid() -> gymnasium.Env:
+            return TransformReward(Bonanza(), lambda r: reward * r)
+
+        def in_units(self, episode):
+            found = curiosity(self, episode)
+            return found._replace(reward=bonus * found.reward)
+
+        monkeypatch.setattr(Curiosity, "bonus", in_units)
+        ppo = {"rollout_steps": 20, "scale_rewards": scaled, "scale_advantages": scaled}
+        name = register("Paid-v0", paid, 5)
+        trainer = finish(run_config(name, "mace_fixed", episodes=40, ppo=ppo))
+        assert len(trainer.curiosity.novelty.visited) > 20  # all of novelty was at work
+        assert sum(record.extrinsic_return for record in trainer.records) > 40 * reward
+        return {name: adam.parameters.tobytes() for name, adam in trainer.ppo.optimisers.items()}
+
+    for scaled in (True, False):
+        same = learned(64.0, 1.0, scaled) == learned(reward, bonus, scaled)
+        assert same == scaled
+
+
+# --- Normalised observations --------------------------------------------------------------------
 
 
 def test_observations_are_standardised_by_everything_seen_and_clipped(make_ppo):
@@ -128,11 +165,7 @@ def test_observations_are_standardised_by_everything_seen_and_clipped(make_ppo):
     assert found.dtype == np.float32 and np.abs(found[-1]).max() == 10
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert make_ppo(normalise_observations=False).normalise(observations) is observations
-
-
-def test_a_dimension_that_never_varied_is_only_centred(make_ppo):
-    ppo = make_ppo(normalise_observations=True)
-    observations = np.full((5, 4), 3.25, np.float32)
-    assert (ppo.normalise(observations) == observations).all()  # nothing seen yet
-    ppo.normaliser.update(observations)
-    assert (ppo.normalise(observations) == 0).all()
+    constant, same = make_ppo(normalise_observations=True), np.full((5, 4), 3.25, np.float32)
+    assert (constant.normalise(same) == same).all()  # nothing seen yet
+    constant.normaliser.update(same)
+    assert (constant.normalise(same) == 0).all()  # never varied: only centred

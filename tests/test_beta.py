@@ -1,25 +1,28 @@
-"""β: what its network is asked for and what it learns; that it follows what helped."""
+"""β by schedule, at random, by a bandit and learned: each against a computation of its own."""
 
-import copy
 import math
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from gymnasium.spaces import Discrete
-from shared import Twin, beta_of, environment_of, finish
+from scipy.stats import kstest
+from shared import environment_of, finish
 
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.progress import FAST, IMPROVEMENT, SLOW, Progress
+from mace_rl.config.section import ConfigError
 from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
 
 ROOT = Path(__file__).parents[1]
+ARMS = [0.0, 0.1, 0.4, 1.0]
+BANDIT = {"kind": "bandit", "arms": ARMS, "window": 90, "exploration": 1.0, "epsilon": 0.1}
+RANDOM = {"kind": "random", "low": 0.2, "high": 0.7}
 
 
 def episode_of(rng, name="CartPole-v1", length=20) -> Episode:
@@ -34,6 +37,138 @@ def episode_of(rng, name="CartPole-v1", length=20) -> Episode:
         rewards=rng.standard_normal(length),
         terminated=True,
     )
+
+
+def paying(extrinsic_return: float, length: int = 1) -> Episode:
+    """An episode of which only its return and length are looked at."""
+    rewards = np.zeros(length)
+    rewards[-1] = extrinsic_return
+    return Episode(np.zeros((length + 1, 1), np.float32), None, None, rewards, True)
+
+
+@pytest.fixture
+def follow(run_config):
+    """`follow(returns, lengths, seed, rollout_steps, variant, **beta)`: β in each episode."""
+
+    def play(
+        returns, lengths, seed=0, rollout_steps=1, variant="mace_fixed", **beta
+    ) -> list[float]:
+        changes = {"beta": beta} if beta else {}
+        ppo = {"rollout_steps": rollout_steps}
+        config = run_config("CartPole-v1", variant, seed, ppo=ppo, **changes)
+        rule = beta_controller(config, environment_of("CartPole-v1"), Streams(seed))
+        assert not rule.learns
+        betas = []
+        for value, length in zip(returns, lengths, strict=True):
+            betas.append(rule.beta)
+            assert rule.beta == betas[-1]  # asking again changes nothing
+            rule.next_episode(paying(value, length), np.zeros(length))
+        return betas
+
+    return play
+
+
+# --- Schedules ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("beta", "expected"),
+    [
+        ({"kind": "constant", "value": 0.3}, [0.3] * 6),
+        (
+            {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06},
+            [0.4, 0.2, 0.1, 0.06, 0.06, 0.06],
+        ),
+    ],
+)
+def test_schedules_by_hand(follow, beta, expected):
+    assert follow(np.zeros(6), [1] * 6, **beta) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("variant", "initial"), [("mace_fixed", 0.4), ("mace_fixed_0.2", 0.2), ("mace_fixed_0.6", 0.6)]
+)
+def test_the_paper_s_schedules(follow, variant, initial):
+    betas = follow(np.zeros(5000), [1] * 5000, variant=variant)
+    assert betas[0] == initial and betas[-1] == 0.01
+    assert betas[1000] == pytest.approx(initial * math.exp(1000 * math.log(0.999)))
+
+
+# --- At random, and by a bandit -----------------------------------------------------------------
+
+
+def test_random_is_uniform_from_its_own_stream(follow):
+    found = follow(np.ones(3000), [1] * 3000, seed=5, **RANDOM)
+    assert found == Streams(5)["beta"].uniform(0.2, 0.7, 3000).tolist()
+    assert kstest(found, "uniform", args=(0.2, 0.5)).pvalue > 0.01
+
+
+def arms_by_the_whole_history(returns, lengths, rollout_steps, window, exploration, epsilon, seed):
+    """The arm of every episode, each rollout's computed anew from all that was before it."""
+    rng, arms, steps, rollouts = Streams(seed)["beta"], [], 0, [[]]
+    chosen = [0]  # by rollout
+    for i, length in enumerate(lengths):
+        arms.append(chosen[-1])
+        rollouts[-1].append(returns[i])
+        steps += length
+        if steps < rollout_steps:
+            continue
+        steps, k = 0, len(chosen)
+        rollouts.append([])
+        if k < len(ARMS):
+            chosen.append(k)
+        elif rng.random() < epsilon:
+            chosen.append(int(rng.integers(len(ARMS))))
+        else:
+            low, high = min(returns[: i + 1]), max(returns[: i + 1])
+            # The reward of rollout m's arm is what rollout m + 1 returned.
+            pulls = [(chosen[m], np.mean(rollouts[m + 1])) for m in range(k - 1)][-window:]
+            bounds = []
+            for arm in range(len(ARMS)):
+                paid = [(reward - low) / (high - low) for one, reward in pulls if one == arm]
+                new = -np.inf if arm == chosen[-1] else np.inf
+                bounds.append(np.mean(paid) + exploration * len(paid) ** -0.5 if paid else new)
+            chosen.append(bounds.index(max(bounds)))
+    return arms
+
+
+@pytest.mark.parametrize("rollout_steps", [1, 40])
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+@pytest.mark.parametrize(("window", "exploration"), [(90, 1.0), (5, 0.1), (4, 0.0)])
+def test_bandit_equals_the_formula_on_its_whole_history(
+    follow, rollout_steps, scale, window, exploration
+):
+    rng = np.random.default_rng(1)
+    returns = (scale * (rng.standard_normal(250) - 3)).tolist()
+    lengths = rng.integers(1, 30, 250).tolist()
+    settings = {"window": window, "exploration": exploration, "epsilon": 0.2}
+    betas = follow(returns, lengths, 7, rollout_steps, **BANDIT | settings)
+    expected = arms_by_the_whole_history(returns, lengths, rollout_steps, seed=7, **settings)
+    assert betas == [ARMS[arm] for arm in expected]
+    assert set(betas) == set(ARMS)
+
+
+def test_bandit_takes_all_arms_alike_when_returns_are_equal(follow):
+    betas = follow([-500.0] * 400, [1] * 400, **BANDIT | {"epsilon": 0.0})
+    assert all(90 <= betas.count(arm) <= 110 for arm in ARMS)
+
+
+@pytest.mark.parametrize(
+    ("beta", "message"),
+    [
+        ({"kind": "constant", "value": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
+        ({"kind": "constant"}, "the key 'beta.value' is missing"),
+        (RANDOM | {"low": 0.8}, "beta .* low is 0.8, which must not exceed high, 0.7"),
+        (BANDIT | {"arms": []}, r"beta.arms is \[\], but .* at least 1 item"),
+        (BANDIT | {"arms": [0, 2]}, "beta.arms.1 is 2, but .* less than or equal to 1"),
+        (BANDIT | {"window": 3}, "beta .* window is 3, which must hold each of the 4 arms"),
+        (BANDIT | {"explore": 1}, "unknown key 'beta.explore' .* 'exploration'"),
+    ],
+)
+def test_wrong_settings_get_one_line(run_config, beta, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        run_config("CartPole-v1", "mace_fixed", beta=beta)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.fixture
@@ -54,25 +189,25 @@ def make(run_config):
 @pytest.mark.parametrize("initial", [0.05, 0.4, 0.9])
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
 def test_beta_starts_at_initial_and_stays_in_0_to_1(make, environment, initial):
-    controller = make(environment, initial)
-    assert controller.beta == initial
-    rng = np.random.default_rng(0)
+    controller, rng = make(environment, initial, learning_rate=0.0), np.random.default_rng(0)
+    assert controller.beta == initial and not controller.learns  # frozen: untrained for ever
     for scale in (1, 100, 1e4):
         episode = episode_of(rng, environment)
         episode.rewards[:] *= scale
         controller.next_episode(episode, rng.random(20))
         assert 0 < controller.beta < 1
-        assert controller.beta == pytest.approx(initial, abs=0.05)  # untrained
+        assert controller.beta == pytest.approx(initial, abs=0.05)
 
 
 def test_sequence_is_state_action_reward_bonus(make):
     controller, rng = make(max_sequence=None), np.random.default_rng(0)
     episode, bonus = episode_of(rng, length=6), rng.random(6)
     controller.normaliser.update(3 + 2 * rng.standard_normal((50, 4)))
+    episode.observations[2, :2] = [1e6, -1e6]  # far from all that was seen
     mean, std = controller.normaliser.mean, controller.normaliser.std
     rows = [
         [
-            *((episode.observations[t] - mean) / std),
+            *((episode.observations[t] - mean) / std).clip(-10, 10),
             *(float(episode.actions[t] == action) for action in (0, 1)),
             math.copysign(math.log(1 + abs(episode.rewards[t])), episode.rewards[t]),
             math.log(1 + bonus[t]),
@@ -83,21 +218,6 @@ def test_sequence_is_state_action_reward_bonus(make):
     found = controller.sequence(episode, bonus, 0.3)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, rows, rtol=1e-5)
-
-
-def test_what_is_far_from_all_that_was_seen_does_not_flood_the_lstm(make):
-    controller, rng = make(), np.random.default_rng(0)
-    controller.normaliser.update(rng.standard_normal((50, 4)))
-    episode = episode_of(rng, length=6)
-    episode.observations[2] = [1e6, -1e6, 0, 0]
-    found = controller.sequence(episode, np.zeros(6), 0.4)[2, :2]
-    assert found.tolist() == [10, -10]
-
-
-def test_one_credit_counts_for_no_more_than_the_bound(make):
-    controller = make(max_credit=2.5, horizon=4)
-    for credit, expected in ((3.0, 1.5), (-3.0, -1.5), (4.9, 2.45), (100.0, 2.5), (-100.0, -2.5)):
-        assert controller.bounded(credit) == expected  # of four terms, whose noise is 2
 
 
 @pytest.mark.parametrize("length", [5, 6, 7, 13, 60])
@@ -121,25 +241,16 @@ def test_long_sequences_are_condensed(make, length):
         assert row[5] == pytest.approx(math.log(1 + summed), rel=1e-5)
 
 
-def test_beta_of_the_next_episode_is_the_lstm_s_answer_to_the_last(make):
-    controller, rng = make(hidden_units=5), np.random.default_rng(0)
-    controller.next_episode(episode_of(rng, length=7), rng.random(7))
-    expected = beta_of(Twin(controller.network), controller.sources[-1])
-    assert controller.beta == pytest.approx(expected.item(), abs=1e-6)
-
-
 # --- What is learned -----------------------------------------------------------------------------
 
 
 def slow_progress(returns: list[float], beta: float) -> list[float]:
     """`Progress.features` from the whole history."""
-    fast, slow, averages = returns[0], returns[0], []
-    best, stalled = returns[0], 0
+    fast = slow = best = returns[0]
+    stalled = 0
     for count, value in enumerate(returns[1:], start=2):
-        weight_fast, weight_slow = max(FAST, 1 / count), max(SLOW, 1 / count)
-        fast = (1 - weight_fast) * fast + weight_fast * value
-        slow = (1 - weight_slow) * slow + weight_slow * value
-        averages.append(fast)
+        fast += max(FAST, 1 / count) * (value - fast)
+        slow += max(SLOW, 1 / count) * (value - slow)
         stalled += 1
         if fast > best + IMPROVEMENT * np.std(returns[:count]):
             best, stalled = fast, 0
@@ -148,46 +259,15 @@ def slow_progress(returns: list[float], beta: float) -> list[float]:
     return [*features, math.log(beta / (1 - beta)) / 2]
 
 
-@pytest.mark.parametrize("kind", ["noise", "rise", "constant", "fall"])
-def test_progress_equals_a_slow_computation(kind):
+@pytest.mark.parametrize(("trend", "noise"), [(0, 5), (1, 5), (0, 0), (-1, 5)])
+def test_progress_equals_a_slow_computation(trend, noise):
     rng, progress = np.random.default_rng(0), Progress()
-    trend = {"noise": 0.0, "rise": 1.0, "constant": 0.0, "fall": -1.0}[kind]
-    returns = [trend * n + 5 * (kind != "constant") * rng.standard_normal() for n in range(60)]
+    returns = [trend * n + noise * rng.standard_normal() for n in range(60)]
     for count in range(1, 61):
         progress.update(returns[count - 1])
         expected = np.clip(slow_progress(returns[:count], 0.3), -3, 3)
         np.testing.assert_allclose(progress.features(0.3), expected, rtol=1e-6, atol=1e-9)
-    stalled = progress.features(0.3)[2]
-    assert (stalled < 1.0) == (kind == "rise")
-
-
-def judge(controller: MetaAdaptation, credits: list[float]) -> float | None:
-    """Let one episode each get these credits, with what is usual fixed at 1."""
-    controller.alignments = controller.alignment_weight = 1e12
-    gradient = np.array([1.0, 0.0], np.float32)
-    effects = [Effect(np.array([c, math.sqrt(1 - c * c)], np.float32), 1.0) for c in credits]
-    controller.learn(np.zeros(2, np.float32), 0.0, effects)
-    return controller.learn(gradient, 1.0, [])
-
-
-@pytest.mark.parametrize("credits", [[0.7], [-0.7], [0.5, -0.2, 0.9]])
-def test_lstm_receives_credit_and_prior_through_the_logit(make, learned, credits):
-    controller, rng = make(hidden_units=6, horizon=1, prior=0.3), np.random.default_rng(0)
-    controller.network.split(controller.network.parameters)[-1][:] += 0.7  # away from the prior
-    for _ in range(len(credits) + 1):  # the first β is given, so one more
-        controller.next_episode(episode_of(rng), rng.random(20))
-    sequences = list(controller.sources)[1 : len(credits) + 1]
-    controller.sources.popleft()
-    twin = Twin(controller.network)
-    assert judge(controller, credits) == pytest.approx(np.mean(credits), abs=1e-6)
-    logits = [twin(sequence) for sequence in sequences]
-    initial = math.log(0.4 / 0.6)
-    terms = [c * x - 0.3 / 2 * (x - initial) ** 2 for c, x in zip(credits, logits, strict=True)]
-    # Adam descends, so the gradient is that of minus the objective.
-    expected = twin.gradient(-torch.cat(terms).mean())
-    (gradient,) = learned
-    np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-6)
-    assert all((part != 0).any() for part in controller.network.split(gradient))
+    assert (progress.features(0.3)[2] < 1.0) == (trend > 0)  # not stalled
 
 
 @pytest.mark.parametrize(("credit", "rises"), [(0.8, True), (-0.8, False)])
@@ -207,54 +287,6 @@ def test_beta_follows_what_helped_and_comes_back_when_nothing_is_left_to_learn(m
     learned = play(150, 1.0)
     assert (learned > 0.9) if rises else (learned < 0.1)
     assert play(600, 1e-6) == pytest.approx(0.4, abs=0.05)
-
-
-@pytest.mark.parametrize("missing", ["strength", "influence"])
-def test_no_credit_without_extrinsic_or_intrinsic_advantage(make, missing):
-    """Half as much of either is half the credit, however large the gradients are."""
-    found = {}
-    for share in (1.0, 0.5):
-        controller = make(horizon=1)
-        controller.next_episode(episode_of(np.random.default_rng(0)), np.ones(20))
-        controller.sources.popleft()
-        controller.alignments = controller.alignment_weight = 1e12
-        given = {"strength": 1.0, "influence": 1.0} | {missing: share}
-        effect = Effect(np.array([3.0, 4.0], np.float32), given["influence"])
-        controller.learn(np.zeros(2, np.float32), 0.0, [effect])
-        gradient = np.array([given["strength"], 0], np.float32)
-        found[share] = controller.learn(gradient, given["strength"], [])
-    assert found[1.0] == pytest.approx(0.6) and found[0.5] == pytest.approx(0.3)
-
-
-def test_a_frozen_network_gives_the_initial_beta_for_ever(make):
-    controller = make(learning_rate=0.0)
-    before = controller.network.parameters.copy()
-    assert not controller.learns
-    for seed in range(5):
-        controller.next_episode(episode_of(np.random.default_rng(seed)), np.ones(20))
-        assert controller.beta == pytest.approx(0.4, abs=0.05)
-    assert (controller.network.parameters == before).all()
-
-
-def test_restored_controller_continues_to_the_bit(make):
-    original, restored, rng = make(horizon=3), make(horizon=3), np.random.default_rng(0)
-
-    def step(controllers, several: bool) -> None:
-        episodes = [episode_of(rng) for _ in range(2 if several else 1)]
-        gradient, *changes = rng.standard_normal((len(episodes) + 1, 9)).astype(np.float32)
-        for controller in controllers:
-            for episode in episodes:
-                controller.next_episode(episode, np.ones(20))
-            controller.learn(gradient, 0.7, [Effect(change, 0.5) for change in changes])
-
-    for several in (False, True, False, False, True):
-        step([original], several)
-    restored.load_state_dict(copy.deepcopy(original.state_dict()))
-    for several in (True, False, False, True, False):
-        step([original, restored], several)
-        assert original.beta == restored.beta
-    assert (original.network.parameters == restored.network.parameters).all()
-    assert original.optimiser.time > 5
 
 
 @pytest.mark.slow

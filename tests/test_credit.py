@@ -22,11 +22,10 @@ from mace_rl.train import Trainer
 # --- The meta gradient --------------------------------------------------------------------------
 
 
-class TwoStepProblem:
-    """Two decisions, a reward after each: J and its gradient are exact sums over 4 × 2 paths.
+class SmallProblem:
+    """One decision in each of three states: J and its gradient are exact sums over 3 × 2 cases.
 
-    The second state is reached by the first action; the parameters are in float64, so that finite
-    differences of J are.
+    The parameters are in float64, so that finite differences of J are.
     """
 
     def __init__(self, seed: int) -> None:
@@ -35,49 +34,32 @@ class TwoStepProblem:
         self.set(0.7 * rng.standard_normal(len(self.actor.parameters)))
         # Reward of each action in each state, for the two kinds.
         self.extrinsic, self.intrinsic = rng.standard_normal((2, 3, 2))
-        self.paths = [(a, b) for a in (0, 1) for b in (0, 1)]
 
     def set(self, parameters: np.ndarray) -> None:
         self.parameters = self.actor.network.parameters = parameters
 
-    def policy(self) -> np.ndarray:
-        """π(a|s), [3, 2]: softmax of the network's outputs."""
+    def returns(self, rewards: np.ndarray) -> np.ndarray:
+        """What each action in each state adds to the current policy's J, [3, 2]."""
         logits = self.actor.forward(np.eye(3)).outputs
-        return np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
-
-    def objective(self, rewards: np.ndarray) -> float:
-        """Expected return of the current policy, exactly."""
-        policy = self.policy()
-        return sum(
-            policy[0, a] * policy[1 + a, b] * (rewards[0, a] + rewards[1 + a, b])
-            for a, b in self.paths
-        )
+        return np.exp(logits) / np.exp(logits).sum(1, keepdims=True) * rewards
 
     def gradient(self, rewards: np.ndarray) -> np.ndarray:
-        """∇J through `PPO.policy_gradients`: every path, weighted with its probability."""
-        policy, states, actions, advantages = self.policy(), [], [], []
-        for a, b in self.paths:
-            probability = policy[0, a] * policy[1 + a, b]
-            later = rewards[1 + a, b]
-            states += [0, 1 + a]
-            actions += [a, b]
-            advantages += [probability * (rewards[0, a] + later), probability * later]
+        """∇J through `PPO.policy_gradients`: every case, weighted with its probability."""
         ppo = PPO.__new__(PPO)
         ppo.policy = self.actor
-        (gradient,) = ppo.policy_gradients(
-            np.eye(3)[states], np.array(actions), [np.array(advantages)]
-        )
-        return len(states) * gradient  # of the sum
+        states, actions = np.eye(3).repeat(2, axis=0), np.array([0, 1] * 3)
+        (mean,) = ppo.policy_gradients(states, actions, [self.returns(rewards).ravel()])
+        return 6 * mean
 
 
-@pytest.mark.parametrize("beta", [0.1, 0.4, 0.9])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("beta", [0.1, 0.9])
+@pytest.mark.parametrize("seed", range(3))
 def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
     """dJ_E(θ') / dβ = η ⟨g_E(θ'), P g_I(θ)⟩ for θ' one Adam step along g_E + β g_I from θ.
 
     β is moved by hand on the left, through Adam as it is, whose moments have a history.
     """
-    problem, rng = TwoStepProblem(seed), np.random.default_rng(seed)
+    problem, rng = SmallProblem(seed), np.random.default_rng(seed)
     start = problem.parameters.copy()
     extrinsic = problem.gradient(problem.extrinsic)
     intrinsic = problem.gradient(problem.intrinsic)
@@ -97,7 +79,7 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
     def next_return(beta: float) -> float:
         problem.set(start.copy())
         adam(problem.parameters).step(-(extrinsic + beta * intrinsic))
-        return problem.objective(problem.extrinsic)
+        return problem.returns(problem.extrinsic).sum()
 
     measured = (next_return(beta + 1e-3) - next_return(beta - 1e-3)) / 2e-3
     after = problem.gradient(problem.extrinsic)
@@ -111,23 +93,20 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
 
 
 class Watched(Trainer):
-    """Keeps, round by round, what was played, by which weights, and what reached the LSTM.
+    """Keeps, round by round, what was played, by which weights, and what reached the LSTM."""
 
-    learned: the gradients that reached any optimiser so far.
-    """
-
-    def __init__(self, config: RunConfig, learned: list[np.ndarray]) -> None:
+    def __init__(self, config: RunConfig) -> None:
         super().__init__(config)
-        self.learned = learned
         self.rounds: list[Round] = []
 
     def adapt(self, rollout: list[Experience]) -> float | None:
-        meta, adam = Twin(self.controller.network), self.ppo.optimisers["actor"]
-        policy, square, before = adam.parameters.copy(), adam.square.copy(), len(self.learned)
-        credit = super().adapt(rollout)
+        meta, adam, learned = Twin(self.controller.network), self.ppo.optimisers["actor"], []
+        policy, square, step = adam.parameters.copy(), adam.square.copy(), Adam.step
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Adam, "step", lambda s, g: (learned.append(g.copy()), step(s, g))[1])
+            credit = super().adapt(rollout)
         directions = [judged.direction.copy() for judged in self.controller.judged[-len(rollout) :]]
-        learned, time = self.learned[before:], adam.time
-        self.rounds.append(Round(rollout, policy, square, time, meta, directions, learned))
+        self.rounds.append(Round(rollout, policy, square, adam.time, meta, directions, learned))
         return credit
 
 
@@ -144,16 +123,16 @@ class Round(NamedTuple):
 
 
 @pytest.fixture(
+    scope="module",
     params=[
         ("CartPole-v1", 1, "compiled"),
         ("CartPole-v1", 80, "compiled"),
-        ("Pendulum-v1", 1, "compiled"),
         ("Pendulum-v1", 400, "compiled"),
         ("CartPole-v1", 80, "torch"),
     ],
     ids=str,
 )
-def watched(request, run_config, learned) -> Watched:
+def watched(request, run_config) -> Watched:
     """A finished short run; a rollout is one episode, or several."""
     environment, steps, engine = request.param
     several = steps > 1
@@ -163,7 +142,7 @@ def watched(request, run_config, learned) -> Watched:
         "ppo": {"rollout_steps": steps, "gae_lambda": 0.95, "centre_advantages": several},
         "meta": {"hidden_units": 16, "horizon": 2},
     }
-    trainer = Watched(run_config(environment, "mace_full", 2, **changes), learned)
+    trainer = Watched(run_config(environment, "mace_full", 2, **changes))
     assert [record.episode for record in finish(trainer).records] == [*range(1, 15)]
     assert (max(len(each.rollout) for each in trainer.rounds) > 1) == several
     return trainer
@@ -214,10 +193,8 @@ def test_direction_is_how_the_update_moves_with_beta(watched):
     """The change of the first step's direction with each episode's β, over √v̂ + ε, at length 1.
 
     That direction is the policy gradient of normalised A_E + β A_I, each in units of its scale.
-    So what of A_I is parallel to A changes nothing, however well it is aligned with
-    g_E.
+    So what of A_I is parallel to A changes nothing, however well it is aligned with g_E.
     """
-
     centred = watched.config.ppo.centre_advantages
 
     def update(each: Round, number: int, step: float) -> np.ndarray:

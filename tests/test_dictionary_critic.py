@@ -1,8 +1,5 @@
 """NEC's dictionary as a critic: against loops over its entries, and what it promises."""
 
-import copy
-import io
-
 import numpy as np
 import pytest
 import torch
@@ -11,9 +8,7 @@ from shared import environment_of, finish
 from mace_rl import factories
 from mace_rl.agent.ppo import PPO, Batch
 from mace_rl.config.section import ConfigError
-from mace_rl.runs import run
 from mace_rl.runs.agent import Agent, load_agent
-from mace_rl.runs.checkpoint import archive
 from mace_rl.streams import Streams
 from mace_rl.train import Trainer
 
@@ -26,8 +21,7 @@ def make_ppo(run_config):
     """`make_ppo(critic, **settings of ppo)`: CartPole's, with both critics."""
 
     def make(critic=DICTIONARY, **settings) -> PPO:
-        settings = {"normalise_observations": False, "critic": critic} | settings
-        config = run_config("CartPole-v1", "ppo", 0, ppo=settings)
+        config = run_config("CartPole-v1", "ppo", 0, ppo={"critic": critic} | settings)
         return factories.ppo(config, environment_of("CartPole-v1"), True, Streams(0))
 
     return make
@@ -109,18 +103,6 @@ def test_values_equal_a_search_entry_by_entry(make_ppo, monkeypatch, capacity, n
     assert len(critic) == min(capacity, 30)
 
 
-def test_the_least_recently_used_state_is_overwritten(make_ppo):
-    settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
-    critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
-    a, b, c, d = np.eye(4, dtype=np.float32)
-    for state, value in ((a, 1), (b, 2), (c, 3)):
-        critic.remember(batch_of(state[None], [value]))
-    assert critic.values(a[None]) == 1  # read: b is now the oldest
-    critic.remember(batch_of(d[None], [4]))
-    assert (critic.values(np.stack([a, c, d])) == [1, 3, 4]).all() and len(critic) == 3
-    assert critic.values(b[None]) != 2
-
-
 def test_of_more_new_states_than_fit_the_last_are_kept(make_ppo):
     settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
     critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
@@ -129,59 +111,23 @@ def test_of_more_new_states_than_fit_the_last_are_kept(make_ppo):
     assert (critic.values(states[2:]) == [3, 4, 5]).all() and len(critic) == 3
 
 
-def test_one_experience_counts_at_once(make_ppo):
-    """A thousand states worth nothing; then, in one update, one that is worth 10."""
-    rng = np.random.default_rng(0)
-    known, place = rng.standard_normal((1000, 4)), np.array([0.5, -0.5, 0.5, 0.5])
-    near = (place + 0.02 * rng.standard_normal((20, 4))).astype(np.float32)
-    far = (-place + 0.02 * rng.standard_normal((20, 4))).astype(np.float32)
-    change = {}
-    for critic in (DICTIONARY | {"kernel_bandwidth": 0.001}, {"kind": "network"}):
-        ppo = make_ppo(critic)
-        ppo.normaliser.update(known)
-        for _ in range(30):
-            ppo.update(batch_of(known, np.zeros(1000)))
-        before = [ppo.critics["extrinsic"].values(states) for states in (near, far)]
-        ppo.update(batch_of(place[None], [10]))
-        after = [ppo.critics["extrinsic"].values(states) for states in (near, far)]
-        change[critic["kind"]] = [(b - a).mean() for a, b in zip(before, after, strict=True)]
-    assert change["dictionary"][0] > 5 and abs(change["dictionary"][1]) < 0.1
-    assert abs(change["network"][0]) < 1
-
-
-@pytest.mark.parametrize("minibatch_size", [None, 16])
-def test_the_actor_learns_as_with_networks(make_ppo, minibatch_size):
+def test_the_actor_learns_as_with_networks(make_ppo):
     batch = batch_of(np.random.default_rng(0).standard_normal((50, 4)), np.ones(50))
-    ppos = [make_ppo(c, minibatch_size=minibatch_size) for c in (DICTIONARY, {"kind": "network"})]
+    ppos = [make_ppo(c, minibatch_size=16) for c in (DICTIONARY, {"kind": "network"})]
     norms = [ppo.update(batch).gradient_norms for ppo in ppos]
     assert (ppos[0].policy.parameters == ppos[1].policy.parameters).all()
     assert norms[0] == {"actor": norms[1]["actor"], "extrinsic": 0.0, "intrinsic": 0.0}
     assert list(ppos[0].optimisers) == ["actor"]
 
 
-@pytest.mark.parametrize("settings", [{}, {"normalise_observations": False, "rollout_steps": 60}])
-@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])
-def test_saved_midway_it_continues_to_the_bit(run_config, environment, settings):
-    ppo = {"critic": DICTIONARY | {"capacity": 150}} | settings
-    config = run_config(environment, "mace_full", 0, episodes=10, ppo=ppo)
-    original, restored = Trainer(config), Trainer(config)
-    rounds = original.run()
-    while len(original.records) < 5:
-        next(rounds)
-    saved = archive(copy.deepcopy(original.state_dict()))
-    restored.load_state_dict(torch.load(io.BytesIO(saved), weights_only=True))
-    assert finish(original).records == finish(restored).records
-    assert archive(original.state_dict()) == archive(restored.state_dict())
-
-
-@pytest.mark.parametrize("environment", ["CartPole-v1", "FrozenLake-v1"])
-@pytest.mark.parametrize("normalise", [False, True])
-def test_agent_on_disk_has_the_same_values(run_config, tmp_path, environment, normalise):
+@pytest.mark.parametrize(
+    ("environment", "normalise"), [("CartPole-v1", True), ("FrozenLake-v1", False)]
+)
+def test_agent_on_disk_has_the_same_values(run_config, trained, environment, normalise):
     ppo = {"critic": DICTIONARY, "normalise_observations": normalise}
     config = run_config(environment, "mace_fixed", 0, episodes=4, ppo=ppo)
-    empty = Agent(Trainer(config).ppo)
-    run.run(config, tmp_path)
-    agent, trainer = load_agent(tmp_path), finish(config)
+    empty, trainer = Agent(Trainer(config).ppo), finish(config)
+    agent = load_agent(trained(environment, "mace_fixed", episodes=4, ppo=ppo))
     space = trainer.environment.observation_space
     space.seed(0)
     rows = np.stack([trainer.environment.encode(space.sample()) for _ in range(40)])
@@ -192,19 +138,11 @@ def test_agent_on_disk_has_the_same_values(run_config, tmp_path, environment, no
         assert (empty.critics[kind](torch.from_numpy(seen)) == 0).all()
 
 
-@pytest.mark.parametrize("variant", ["ppo", "mace_fixed"])
-def test_it_learns_cartpole(run_config, variant):
-    config = run_config("CartPole-v1", variant, 1, episodes=80, ppo={"critic": DICTIONARY})
-    returns = [record.extrinsic_return for record in finish(config).records]
-    assert np.mean(returns[:10]) < 60 and np.mean(returns[-20:]) > 150  # random actions: 22
-
-
 @pytest.mark.parametrize(
     ("critic", "message"),
     [
         ({"neighbours": 2001}, "neighbours is 2001, which must not exceed capacity, 2000"),
         ({"learning_rate": 1.5}, "ppo.critic.learning_rate is 1.5, but .* less than or equal to 1"),
-        ({"kind": "table"}, "ppo.critic .*'table'"),
         ({"capacty": 3}, "unknown key 'ppo.critic.capacty' .* 'capacity'"),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 import torch
 from numba import njit
 from scipy import special
-from shared import LAYER_NORM, Twin, layer_norm
+from shared import LAYER_NORM, layer_norm
 
 from mace_rl.agent import kernels
 from mace_rl.agent.network import CompiledMLP, TorchNetwork, mlp, network
@@ -23,9 +23,10 @@ from mace_rl.config.section import ConfigError
 CASES = []  # compiled form, torch module from a generator, shape of the inputs
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
     CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
+CASES.append((TorchNetwork, lambda rng: layer_norm(6, 3, [16]), (20, 6)))
 for size in (1, 2, 15):
     CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
-for units, steps in product((1, 5, 128), (1, 2, 32, 300)):
+for units, steps in product((1, 5, 128), (1, 32, 300)):
     CASES.append((CompiledMetaNetwork, partial(MetaNetwork, 7, units, 0.4), (steps, 7)))
 
 
@@ -44,9 +45,10 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
     grad_outputs = rng.standard_normal(expected.shape)
     loss = (expected * torch.from_numpy(grad_outputs)).sum()
     gradients = [g.numpy() for g in torch.autograd.grad(loss, double.parameters())]
-    for one in (compiled(module), TorchNetwork(module)):
+    for one in (compiled(copy.deepcopy(module)), TorchNetwork(module)):
         trace = one.forward(inputs)
         np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
+        one.backward(trace, np.ones_like(trace.outputs))  # β's credit goes back more than once
         found = one.backward(trace, grad_outputs.astype(np.float32))
         transposed = isinstance(one, CompiledMLP)
         flat = np.concatenate([(g.T if transposed else g).ravel() for g in gradients])
@@ -54,6 +56,10 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
         np.testing.assert_allclose(found, flat, rtol=1e-3, atol=tolerance)
         assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
         assert found.shape == one.parameters.shape
+        other = type(one)(make(np.random.default_rng(1)))
+        held = other.parameters
+        other.load_module_state(copy.deepcopy(one.module().state_dict()))
+        assert (other.parameters == one.parameters).all() and other.parameters is held
         again = copy.deepcopy(one.module())(torch.from_numpy(inputs)).detach()
         np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
 
@@ -70,15 +76,6 @@ def test_both_engines_start_alike(run_config):
 
     for one, other in zip(outputs("compiled"), outputs("torch"), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize(("compiled", "make", "shape"), CASES[3:-1:5])
-def test_a_network_takes_over_the_weights_of_its_module(compiled, make, shape):
-    for wrap in (compiled, TorchNetwork):
-        one, other = (wrap(make(np.random.default_rng(seed))) for seed in (0, 1))
-        held = other.parameters
-        other.load_module_state(copy.deepcopy(one.module().state_dict()))
-        assert (other.parameters == one.parameters).all() and other.parameters is held
 
 
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
@@ -118,19 +115,6 @@ def test_meta_network_is_pytorch_s_lstm_with_a_readout(length):
     torch.testing.assert_close(module(sequence), expected)
 
 
-def test_meta_network_gradient_equals_finite_differences():
-    rng = np.random.default_rng(0)
-    module = MetaNetwork(3, 4, 0.4, rng).double()
-    sequence = torch.from_numpy(rng.standard_normal((6, 3)))
-    names, values = zip(*module.named_parameters(), strict=True)
-
-    def logit(*parameters: torch.Tensor) -> torch.Tensor:
-        weights = dict(zip(names, parameters, strict=True))
-        return torch.func.functional_call(module, weights, sequence)
-
-    assert torch.autograd.gradcheck(logit, values)
-
-
 # --- Compiled functions -------------------------------------------------------------------------
 
 
@@ -158,43 +142,7 @@ def test_compiled_tanh_and_sigmoid(kind):
         assert np.isnan(over(function, np.full(17, np.nan, kind))).all()
 
 
-@pytest.mark.parametrize("hidden", [[1], [64, 64], [3, 4, 5]])
-def test_compiled_forward_of_one_observation_equals_torch(hidden):
-    rng = np.random.default_rng(0)
-    one = CompiledMLP(mlp([6, *hidden, 4], 1.0, rng))
-    one.parameters[:] = rng.standard_normal(len(one.parameters))
-    inputs = rng.standard_normal((50, 6)).astype(np.float32)
-    for observation, row in zip(inputs, Twin(one)(inputs).detach().numpy(), strict=True):
-        found = kernels.forward(observation, one.parameters, one.sizes)
-        assert found.dtype == np.float32
-        np.testing.assert_allclose(found, row, rtol=1e-4, atol=1e-4)
-
-
 # --- Any torch module ---------------------------------------------------------------------------
-
-
-def test_torch_network_is_any_module_and_its_parameters_are_the_flat_vector():
-    torch.manual_seed(0)
-    module = layer_norm(5, 3, [16])
-    one, rng = TorchNetwork(module), np.random.default_rng(0)
-    inputs = rng.standard_normal((20, 5)).astype(np.float32)
-    grad_outputs = rng.standard_normal((20, 3)).astype(np.float32)
-    for memory in (None, np.full(len(one.parameters) + 4, 7, np.float32)):
-        if memory is not None:  # as the policy does, whose own parameters follow
-            before = one.parameters.copy()
-            one.move_to(memory[:-4])
-            assert (one.parameters == before).all() and np.shares_memory(one.parameters, memory)
-            assert (memory[-4:] == 7).all()
-        one.parameters += 0.1 * rng.standard_normal(len(one.parameters)).astype(np.float32)
-        held = torch.cat([part.detach().ravel() for part in module.parameters()])
-        assert (held.numpy() == one.parameters).all()  # views: whoever learns changes the module
-        trace, twin = one.forward(inputs), Twin(one)
-        np.testing.assert_allclose(trace.outputs, twin(inputs).detach(), rtol=1e-4, atol=1e-5)
-        expected = twin.gradient((twin(inputs) * torch.from_numpy(grad_outputs)).sum())
-        for _ in range(2):  # β's credit goes back along one forward pass more than once
-            found = one.backward(trace, grad_outputs)
-            np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
-    assert one.module() is module
 
 
 class Normalised(torch.nn.Sequential):

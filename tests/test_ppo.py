@@ -2,14 +2,13 @@
 
 import copy
 import math
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from shared import Twin
 
-from mace_rl.agent import kernels
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.ppo import PPO, Batch
 from mace_rl.streams import Streams
@@ -78,40 +77,6 @@ def test_actor_gradient_is_that_of_the_clipped_surrogate(
     assert told == pytest.approx([mean.item() for mean in means], rel=1e-4)
 
 
-@both_environments
-def test_gradients_are_means_over_all_steps_of_a_large_batch(make_ppo, monkeypatch, environment):
-    """Of what each step alone gives: blocks, also an incomplete last one, leave no trace."""
-    ppo = make_ppo(environment)
-    batch = random_batch(ppo, count=20)
-    for gradient in (
-        lambda part: ppo.actor_gradient(part)[0],
-        ppo.critics["extrinsic"].gradient,
-    ):
-        expected = np.mean([gradient(batch[t : t + 1]) for t in range(20)], axis=0)
-        for block in (1, 7, 20, 512):
-            monkeypatch.setattr("mace_rl.agent.ppo.BLOCK", block)
-            np.testing.assert_allclose(gradient(batch), expected, rtol=1e-3, atol=1e-6)
-
-
-def test_surrogate_is_flat_only_where_the_advantage_already_pushed():
-    cases = [  # ratio, advantage, what ∇ log π is weighed with
-        (1.3, 1.0, 0.0),  # good action, already much likelier: no more
-        (1.3, -1.0, -1.3),  # bad action, likelier: correct it
-        (0.7, -1.0, 0.0),  # bad action, already much less likely: no less
-        (0.7, 1.0, 0.7),  # good action, less likely: correct it
-        (1.1, 1.0, 1.1),
-        (0.9, -1.0, -0.9),
-    ]
-    ratios, advantages, expected = np.float32(cases).T
-    before = np.float32(range(6))
-    weights, divergence, outside = kernels.surrogate_weights(
-        before + np.log(ratios), before, advantages, 0.2
-    )
-    np.testing.assert_allclose(weights, expected, rtol=1e-5)
-    assert outside == 4
-    assert divergence == pytest.approx(sum(r - 1 - math.log(r) for r, _, _ in cases), rel=1e-4)
-
-
 @both_engines
 @both_environments
 def test_policy_gradients_equal_autograd(make_ppo, environment, engine):
@@ -166,6 +131,7 @@ def test_a_preconditioned_direction_by_hand():
     "changes",
     [
         {},
+        # More steps than the gradients take at once, and the last block is not full.
         {"minibatch_size": None, "entropy_coefficient": 0.05, "max_gradient_norm": 0.3},
         {"minibatch_size": 45},
     ],
@@ -176,7 +142,7 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
     defaults = {"minibatch_size": 256, "entropy_coefficient": 0.0, "max_gradient_norm": 0.5}
     minibatch_size, entropy_coefficient, max_gradient_norm = (defaults | changes).values()
     ppo = make_ppo(environment, seed=5, intrinsic=True, engine=engine, **changes)
-    batch = random_batch(ppo, count=300, spread=0.05)
+    batch = random_batch(ppo, count=700, spread=0.05)
     twins = {"actor": Twin(ppo.policy)} | {k: Twin(critic) for k, critic in ppo.critics.items()}
     rates = {"actor": 3e-4, "extrinsic": 1e-3, "intrinsic": 1e-3}
     optimisers = {
@@ -185,9 +151,9 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
     }
     order = Streams(5)["minibatches"]
     # As even as can be, the larger ones first.
-    sizes = {None: [300], 256: [150] * 2, 45: [43] * 6 + [42]}[minibatch_size]
+    sizes = {None: [700], 256: [234, 233, 233], 45: [44] * 12 + [43] * 4}[minibatch_size]
     for _ in range(4):
-        places = order.permutation(300) if minibatch_size else np.arange(300)
+        places = order.permutation(700) if minibatch_size else np.arange(700)
         told, norms = np.zeros(3), {}  # of the last epoch, and of its last minibatch
         ends = np.cumsum([0, *sizes])
         for part in (batch[places[a:b]] for a, b in pairwise(ends)):
@@ -199,7 +165,7 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
                 losses[kind] = (errors**2).mean()
             clipped = ((ratio - 1).abs() > 0.2).double()
             sums = (ratio - 1 - ratio.log()).sum(), clipped.sum(), policy.entropy().sum()
-            told += [value.item() / 300 for value in sums]
+            told += [value.item() / 700 for value in sums]
             for name, loss in losses.items():
                 optimisers[name].zero_grad()
                 loss.backward()
@@ -216,41 +182,3 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
         expected, found = twin.flat(twin.parameters()), ppo.optimisers[name].parameters
         assert np.abs(found - before[name]).max() > 1e-3
         np.testing.assert_allclose(found, expected, atol=2e-5, err_msg=name)
-
-
-@pytest.mark.parametrize("minibatch_size", [None, 1, 4, 10, 64])
-def test_minibatches_partition_the_batch_in_every_epoch(make_ppo, minibatch_size):
-    ppo = make_ppo(minibatch_size=minibatch_size)
-    batch = random_batch(ppo, count=10)
-    epochs = []
-    for _ in range(3):
-        parts = [part.log_probs.tolist() for part in ppo._minibatches(batch)]
-        assert len(parts) == math.ceil(10 / (minibatch_size or 10))
-        assert all(len(part) <= (minibatch_size or 10) for part in parts)
-        epochs.append([*chain(*parts)])
-        assert sorted(epochs[-1]) == sorted(batch.log_probs.tolist())
-    assert (epochs[0] != epochs[1] != epochs[2]) == (minibatch_size is not None)
-
-
-def test_restored_ppo_continues_to_the_bit(make_ppo):
-    original = make_ppo(intrinsic=True, minibatch_size=8, normalise_observations=True)
-    batch = random_batch(original)
-    original.normaliser.update(batch.observations)
-    original.update(batch)
-    rewards = 5 + batch.advantages.astype(np.float64)
-    for kind in original.critics:
-        original.advantages_and_returns(kind, batch.observations[:21], rewards[:20], True)
-    state = copy.deepcopy(original.state_dict())
-    restored = make_ppo(seed=1, intrinsic=True, minibatch_size=8, normalise_observations=True)
-    restored.load_state_dict(state)
-    for kind in original.critics:
-        episode = kind, batch.observations[20:], 3 * rewards[21:], True
-        found = [ppo.advantages_and_returns(*episode) for ppo in (original, restored)]
-        np.testing.assert_equal(*found)
-        assert original.advantage_scale(kind) == restored.advantage_scale(kind)
-    assert original.update(batch) == restored.update(batch)
-    for name, adam in original.optimisers.items():
-        assert (adam.parameters == restored.optimisers[name].parameters).all()
-    assert (original.normalise(batch.observations) == restored.normalise(batch.observations)).all()
-    policies = original.acting_policy(), restored.acting_policy()
-    assert all((a == b).all() for a, b in zip(*(p[:5] for p in policies), strict=True))

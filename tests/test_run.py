@@ -1,12 +1,18 @@
-"""One run on disk: what it leaves behind, what it says, and which code makes it what it is."""
+"""One run on disk: what it leaves and says; interrupted, it ends as one never disturbed."""
 
-import ast
+import fcntl
 import hashlib
+import itertools
 import json
+import logging
 import os
+import pickle
 import re
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,23 +21,35 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from shared import ENVIRONMENTS, LAYER_NORM, OUTCOME, RESULTS, files, finish, provenance_of
+from shared import (
+    ENVIRONMENTS,
+    LAYER_NORM,
+    OUTCOME,
+    RESULTS,
+    UNFINISHED,
+    Killed,
+    files,
+    finish,
+    provenance_of,
+)
 
 from mace_rl import sources
-from mace_rl.config.reading import merge
+from mace_rl.config.reading import merge_layers
+from mace_rl.config.run import RunConfig
 from mace_rl.environments import hopper
+from mace_rl.files import LOCK
 from mace_rl.runs import checkpoint, provenance, run
-from mace_rl.runs.agent import load_agent
-from mace_rl.runs.evaluate import evaluate
 from mace_rl.runs.finished import read_runs
+from mace_rl.train import Trainer
+
+# --- What a run leaves --------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def finished(run_config, tmp_path_factory):
+@pytest.fixture
+def finished(run_config, trained):
     """A finished run: its configuration and folder, where only the results are left."""
-    config = run_config("CartPole-v1", "mace_full", 0, episodes=5)
-    directory = tmp_path_factory.mktemp("runs") / "deep" / "er"
-    run.run(config, directory)
+    settings = {"variant": "mace_full", "episodes": 5}
+    config, directory = run_config(**settings), trained(**settings)
     assert files(directory) == RESULTS
     return SimpleNamespace(config=config, directory=directory)
 
@@ -47,63 +65,20 @@ def test_the_tables_hold_the_records_to_the_bit(finished):
     np.testing.assert_equal(frame.to_dict("records"), expected)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"engine": "torch"}, {"ppo": {"network": LAYER_NORM}}],
-    ids=["compiled", "torch", "LayerNorm"],
-)
-@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-def test_agent_is_torch_modules_that_act_as_the_trainer_does(
-    run_config, tmp_path, environment, changes
-):
-    """From observations as they are; Pendulum's are normalised, and what the critics get."""
-    box = environment == "Pendulum-v1"
-    changes = merge(changes, {"episodes": 3, "ppo": {"normalise_observations": box}})
-    config = run_config(environment, "mace_full", 0, **changes)
-    run.run(config, tmp_path)
-    agent, trainer, rng = load_agent(tmp_path), finish(config), np.random.default_rng(0)
-    space = trainer.environment.observation_space
-    space.seed(0)
-    rows = np.stack([trainer.environment.encode(space.sample()) for _ in range(50)])
-    noise = rng.standard_normal((50, 1)) if box else rng.random(50)
-    acting, policy = trainer.ppo.acting_policy(), agent.policy(rows)
-    drawn = [acting.act(*pair) for pair in zip(rows, noise, strict=True)]
-    actions, log_probs = (np.array(parts) for parts in zip(*drawn, strict=True))
-    found = policy.log_prob(torch.from_numpy(actions)).detach()
-    np.testing.assert_allclose(found, log_probs, rtol=1e-4, atol=1e-4)
-    if box:
-        expected = policy.mean + policy.stddev * torch.from_numpy(noise)
-        np.testing.assert_allclose(actions, expected.detach(), rtol=1e-4, atol=1e-5)
-    else:
-        expected = (torch.from_numpy(noise)[:, None] >= policy.probs.cumsum(1)).sum(1)
-        assert (actions == expected.numpy()).all()
-    one = agent.policy(rows[0]).log_prob(torch.from_numpy(actions)[0])
-    torch.testing.assert_close(one, policy.log_prob(torch.from_numpy(actions))[0])
-    assert (agent.policy.mean != 0).any() == box
-    for kind, critic in trainer.ppo.critics.items():
-        values = agent.critics[kind](torch.from_numpy(rows)).detach()
-        np.testing.assert_allclose(values[:, 0], critic.values(rows), rtol=1e-4, atol=1e-5)
-    assert np.isfinite(evaluate(tmp_path, 2, 0)).all()
-
-
 def test_run_json_says_where_the_results_come_from(finished):
     found = provenance_of(finished.directory)
     assert found["config"] == finished.config.settings()
-    assert found["versions"]["torch"] == torch.__version__
-    assert found["versions"]["numpy"] == np.__version__
-    assert found["versions"]["gymnasium"] == gymnasium.__version__
+    for module in (torch, np, gymnasium):
+        assert found["versions"][module.__name__] == module.__version__
     assert found["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["sources"] == sources.digest(sources.PACKAGE / "runs" / "run.py")
     assert set(found["code"]) == {"commit", "dirty"}
     assert found["machine"]["cores"] == os.cpu_count() and found["machine"]["cpu"]
-    assert found["threads"] == 1
+    assert found["threads"] == 1 and found["interruptions"] == []
     assert 0 <= found["checkpoint_seconds"] <= found["seconds"] < 600
-    assert found["interruptions"] == []
     assert 50 < found["peak_memory_mb"] < 5000
-    assert found["outputs"] == {
-        name: hashlib.sha256((finished.directory / name).read_bytes()).hexdigest()
-        for name in OUTCOME
-    }
+    contents = {name: (finished.directory / name).read_bytes() for name in OUTCOME}
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    assert found["outputs"] == digests
 
 
 def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
@@ -113,10 +88,9 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
 
     monkeypatch.setattr(provenance.sources, "PACKAGE", tmp_path)
     assert provenance.git_state() == {"commit": None, "dirty": None}
-    git("init")
     (tmp_path / "code.py").write_text("1\n")
-    git("add", "code.py")
-    git("commit", "-m", "one")
+    for command in ("init", "add code.py", "commit -m one"):
+        git(*command.split())
     (tmp_path / "notes").touch()  # not tracked
     clean = {"commit": git("rev-parse", "HEAD"), "dirty": False}
     assert provenance.git_state() == clean
@@ -124,7 +98,39 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
     assert provenance.git_state() == clean | {"dirty": True}
 
 
-def test_seconds_before_an_interruption_count(interrupted):
+@pytest.mark.parametrize(
+    ("environment", "changes", "reason"),
+    [
+        ("HopperBulletEnv-v0", {}, "numpy .* adds numbers in another order"),
+        ("SparseHopper-v0", {}, "numpy .* adds numbers in another order"),
+        ("CartPole-v1", {"environment_arguments": {"sutton_barto_reward": True}}, "steps are not"),
+        ("CartPole-v1", {}, None),
+        ("SparseHopper-v0", {}, None),
+        ("Acrobot-v1", {"engine": "torch"}, None),
+        ("MountainCar-v0", {}, None),
+    ],
+)
+def test_a_fast_path_that_is_not_taken_is_said_once(
+    run_config, tmp_path, monkeypatch, caplog, environment, changes, reason
+):
+    """Of one that is taken, not wanted or not there nothing is said."""
+    if reason:
+        monkeypatch.setattr(hopper, "numpy_adds_as_assumed", lambda: False)
+    config = run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20, **changes)
+    run.run(config, tmp_path)
+    said = [(record.levelname, record.getMessage()) for record in caplog.records]
+    if reason is None:
+        assert said == []
+        return
+    ((level, text),) = said
+    expected = f"the fast path for {environment} is not taken: .*{reason}"
+    assert level == "WARNING" and re.match(expected, text)
+
+
+def test_an_interrupted_run_says_how_far_it_is_and_its_seconds_count(interrupted):
+    progress = json.loads((interrupted.directory / "progress.json").read_text())
+    assert (progress["episode"], progress["episodes"]) == (1, 6)
+    assert progress["env_steps"] == progress["recent_return"]  # CartPole pays 1 a step
     path = interrupted.directory / "checkpoint.pt"
     state = checkpoint.read(path)["state"] | {"seconds": 1000.0, "checkpoint_seconds": 100.0}
     checkpoint.save(path, run.run_identity(interrupted.config), state)
@@ -134,92 +140,7 @@ def test_seconds_before_an_interruption_count(interrupted):
     assert 1000 < found["seconds"] < 1600 and 100 <= found["checkpoint_seconds"] < 200
 
 
-@pytest.mark.parametrize(
-    ("environment", "changes", "reason"),
-    [
-        ("HopperBulletEnv-v0", {}, "numpy .* adds numbers in another order"),
-        ("SparseHopper-v0", {}, "numpy .* adds numbers in another order"),
-        ("CartPole-v1", {"environment_arguments": {"sutton_barto_reward": True}}, "steps are not"),
-    ],
-)
-def test_a_fast_path_that_is_not_taken_is_said_once(
-    run_config, tmp_path, monkeypatch, caplog, environment, changes, reason
-):
-    monkeypatch.setattr(hopper, "numpy_adds_as_assumed", lambda: False)
-    config = run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20, **changes)
-    run.run(config, tmp_path)
-    (record,) = caplog.records
-    assert record.levelname == "WARNING"
-    said = f"the fast path for {environment} is not taken: .*{reason}"
-    assert re.match(said, record.getMessage())
-
-
-@pytest.mark.parametrize("environment", [*ENVIRONMENTS, "SparseHopper-v0", "MountainCar-v0"])
-@pytest.mark.parametrize("engine", ["compiled", "torch"])
-def test_of_a_fast_path_that_is_taken_not_wanted_or_not_there_nothing_is_said(
-    run_config, tmp_path, caplog, environment, engine
-):
-    config = run_config(environment, "ppo", 0, episodes=2, max_episode_steps=20, engine=engine)
-    run.run(config, tmp_path)
-    assert not caplog.records
-
-
-def test_progress_says_how_far_it_is(interrupted):
-    progress = json.loads((interrupted.directory / "progress.json").read_text())
-    assert (progress["episode"], progress["episodes"]) == (1, 6)
-    assert progress["env_steps"] == progress["recent_return"]  # CartPole pays 1 a step
-    assert progress["pid"] == os.getpid()
-
-
-COUNT_THREADS = """
-import sys
-from pathlib import Path
-from threadpoolctl import threadpool_info
-from mace_rl.runs import run
-from mace_rl.config.run import RunConfig
-
-def observe(progress):
-    print({library["filepath"]: library["num_threads"] for library in threadpool_info()})
-
-run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), observe)
-"""
-
-
 @pytest.mark.slow
-def test_a_run_uses_one_thread(run_config, tmp_path):
-    """Whatever the environment says, and in every library, NumPy's BLAS and SciPy's among them."""
-    config = run_config("CartPole-v1", "mace_full", 0, episodes=3)
-    done = subprocess.run(
-        [sys.executable, "-c", COUNT_THREADS, config.model_dump_json(), str(tmp_path)],
-        env={name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    threads = ast.literal_eval(done.stdout.splitlines()[-1])
-    assert any("scipy" in Path(library).parent.name for library in threads)
-    assert any("numpy" in Path(library).parent.name for library in threads)
-    assert set(threads.values()) == {1}
-
-
-@pytest.mark.slow
-def test_identity_covers_every_module_that_training_imports(run_config, monkeypatch):
-    """A change in any of them, or in the user's own, makes the checkpoint one of another code."""
-    script = (
-        "import sys, mace_rl.runs.run\n"
-        "for name, module in sys.modules.items():\n"
-        "    if name.partition('.')[0] == 'mace_rl': print(module.__file__)"
-    )
-    command = [sys.executable, "-c", script]
-    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    imported = {Path(line) for line in listed.split()}
-    assert {path.name for path in imported} >= {"train.py", "ppo.py", "run.py", "__init__.py"}
-    covered, read = set(), Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: (covered.add(path), read(path))[1])
-    run.run_identity(run_config(ppo={"network": LAYER_NORM}))
-    assert imported | {Path(__file__).with_name("shared.py")} <= covered
-
-
 def test_the_peak_of_memory_is_this_process_s_and_not_that_of_who_started_it() -> None:
     child = "from mace_rl.runs.provenance import peak_memory_mb; print(peak_memory_mb())"
     parent = (
@@ -231,3 +152,252 @@ def test_the_peak_of_memory_is_this_process_s_and_not_that_of_who_started_it() -
     )
     held, peak = map(float, done.stdout.split())
     assert held == 600 and 5 < peak < 400
+
+
+# --- Interrupted ---------------------------------------------------------------------------------
+
+SEVERAL = {"rollout_steps": 80, "minibatch_size": 16, "normalise_observations": True}
+
+
+@pytest.mark.parametrize(
+    ("environment", "variant", "changes"),
+    [
+        ("CartPole-v1", "ppo", {}),
+        ("CartPole-v1", "mace_fixed", {"ppo": SEVERAL, "engine": "torch"}),
+        ("CartPole-v1", "mace_full", {"ppo": SEVERAL | {"network": LAYER_NORM}}),
+        *((environment, "mace_full", {}) for environment in ENVIRONMENTS),
+    ],
+)
+def test_resumed_run_equals_uninterrupted_run(
+    run_config, tmp_path, kill, checkpoint_every, completes, environment, changes, variant
+):
+    """Killed twice, between checkpoints, so that lost rounds are played again."""
+    config = run_config(environment, variant, 4, episodes=30 if changes else 8, **changes)
+    checkpoint_every(2)
+    for update in (4, 7):
+        kill(update, config, tmp_path / "killed")
+        assert files(tmp_path / "killed") == UNFINISHED
+    interruptions = completes(config, tmp_path / "killed")["interruptions"]
+    # Resumed where the last checkpoint before the kill was.
+    updates = finish(config).diagnostics
+    found = [item["after_episode"] for item in interruptions]
+    assert found == [updates[1].episode, updates[4].episode]
+    assert all(item["machine"]["cpu"] for item in interruptions)
+
+
+CHILD = """
+import json, sys, time
+from pathlib import Path
+from threadpoolctl import threadpool_info
+from mace_rl.runs import run
+from mace_rl.config.run import RunConfig
+
+def observe(progress):
+    if progress["episode"] < 5:
+        return
+    threads = {library["filepath"]: library["num_threads"] for library in threadpool_info()}
+    own = [m.__file__ for name, m in sys.modules.items() if name.split(".")[0] == "mace_rl"]
+    print(json.dumps([threads, own, progress["episode"]]), flush=True)
+    time.sleep(600)
+
+run.CHECKPOINT_COST, run.OBSERVER_SECONDS = float("inf"), 0.0
+run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), observe)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_is_killed_and_resumed_by_another(
+    run_config, tmp_path, monkeypatch, caplog, completes
+):
+    """And while it lives, a second process in its folder is refused.
+
+    It has one thread, whatever the environment says, in every library, NumPy's BLAS and SciPy's
+    among them. A change in any module that it has imported, or in the user's own, makes its
+    checkpoint one of another code.
+    """
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)
+    ppo = {"network": LAYER_NORM}
+    config = run_config("HopperBulletEnv-v0", "mace_full", 5, episodes=20, ppo=ppo)
+    directory = tmp_path / "Läufe mit Leerzeichen"
+    command = [sys.executable, "-c", CHILD, config.model_dump_json(), str(directory)]
+    environment = {**os.environ, "MACE_RL_CHECKPOINT_SECONDS": "0"}
+    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
+    del environment["OMP_NUM_THREADS"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            threads, imported, episode = json.loads(process.stdout.readline())
+            before = {name: (directory / name).read_bytes() for name in files(directory)}
+            with pytest.raises(run.RunError, match="another process is training in this folder"):
+                run.run(config, directory)
+            assert before == {name: (directory / name).read_bytes() for name in files(directory)}
+        finally:
+            process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert {"numpy", "scipy"} < {Path(library).parts[-2].partition(".")[0] for library in threads}
+    assert set(threads.values()) == {1}
+    with monkeypatch.context() as patched:
+        covered, read = set(), Path.read_bytes
+        patched.setattr(Path, "read_bytes", lambda path: (covered.add(path), read(path))[1])
+        run.run_identity(config)
+    assert {*map(Path, imported), Path(__file__).with_name("shared.py")} <= covered
+    assert {path.name for path in covered} >= {"train.py", "ppo.py", "run.py", "__init__.py"}
+    with caplog.at_level(logging.INFO):
+        assert len(completes(config, directory)["interruptions"]) == 1
+    assert 0 < episode < 20 and "resuming after episode" in caplog.text
+
+
+def test_a_dying_predecessor_is_waited_for(tmp_path):
+    """It holds the folder's lock for a moment after whoever started it is gone."""
+    holder = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    timer = threading.Timer(0.5, os.close, [holder])
+    started = time.monotonic()
+    timer.start()
+    with run.exclusive(tmp_path):
+        assert time.monotonic() - started >= 0.4
+    timer.join()
+
+
+@pytest.mark.parametrize("moment", ["the results", "the fifth checkpoint"])
+def test_killed_while_writing(
+    run_config, tmp_path, monkeypatch, checkpoint_every, completes, moment
+):
+    """What is missing is made from the checkpoint; one half written leaves the one before."""
+    config, directory = run_config(variant="mace_full", episodes=6), tmp_path / "killed"
+    results, times, replace = moment == "the results", itertools.count(1), os.replace
+    checkpoint_every(1)
+
+    def replace_or_die(source, target) -> None:
+        checkpoint = Path(target).name == "checkpoint.pt"
+        if next(times) == 5 if checkpoint and not results else Path(target).name == "run.json":
+            raise Killed
+        replace(source, target)
+
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(os, "replace", replace_or_die)
+        run.run(config, directory)
+    assert files(directory) == sorted([*UNFINISHED, *OUTCOME] if results else UNFINISHED)
+    (directory / "agent.pt").unlink(missing_ok=True)  # as Snakemake does with outputs
+    (directory / ".checkpoint.pt.12345.tmp").write_bytes(b"half a check")  # goes
+    (interruption,) = completes(config, directory)["interruptions"]
+    assert interruption["after_episode"] == (6 if results else 4)
+
+
+@pytest.mark.parametrize("left", [[], RESULTS[:2], RESULTS])
+def test_deleted_results_come_back_from_the_last_checkpoint(
+    run_config, tmp_path, monkeypatch, left
+):
+    config = run_config("CartPole-v1", "mace_full", 0, episodes=4)
+    run.run(config, tmp_path, keep_checkpoint=True)
+    assert files(tmp_path) == sorted([*RESULTS, "checkpoint.pt"])
+    contents = {name: (tmp_path / name).read_bytes() for name in OUTCOME}
+    for name in RESULTS:
+        (tmp_path / name).unlink()
+    for name in left:  # of a job that was killed while it wrote them
+        (tmp_path / name).write_text("stale")
+    monkeypatch.delattr(Trainer, "improve")
+    run.run(config, tmp_path, keep_checkpoint=True)
+    assert {name: (tmp_path / name).read_bytes() for name in OUTCOME} == contents
+    (interruption,) = provenance_of(tmp_path)["interruptions"]
+    assert interruption["after_episode"] == 4
+
+
+# --- Checkpoints --------------------------------------------------------------------------------
+
+
+class Payload:
+    """Creates a file when unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def signed(content: bytes) -> bytes:
+    """As a checkpoint is: with its digest in front."""
+    return hashlib.sha256(content).hexdigest().encode() + b"\n" + content
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda content, _: bytes([content[0] ^ 1]) + content[1:], "cut off or altered"),
+        (lambda content, _: content[:-1] + bytes([content[-1] ^ 1]), "cut off or altered"),
+        (lambda content, _: content[:-1], "cut off or altered"),
+        (lambda content, _: content + b"\0", "cut off or altered"),
+        (lambda content, _: b"", "cut off or altered"),
+        (lambda _, bomb: signed(pickle.dumps(bomb, protocol=2)), "not a readable archive"),
+        (lambda _, bomb: signed(checkpoint.archive({"identity": bomb})), "not a readable archive"),
+    ],
+)
+def test_damaged_checkpoint_is_not_continued(
+    interrupted, completes, caplog, tmp_path, damage, message
+):
+    """Nor is anything executed that is in it."""
+    path, mark = interrupted.directory / "checkpoint.pt", tmp_path / "executed"
+    path.write_bytes(damage(path.read_bytes(), Payload(mark)))
+    assert completes(interrupted.config, interrupted.directory)["interruptions"] == []
+    assert f"starting afresh: {path}: {message}" in caplog.text and not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 1}, "config.seed was 0 and is 1"),
+        ({"environment": "Acrobot-v1"}, "config.environment was 'CartPole-v1' and is 'Acrobot-v1'"),
+        ({"ppo": {"clip": 0.3}}, "config.ppo.clip was 0.2 and is 0.3"),
+        ({"beta": {"kind": "none"}}, "config.beta.kind was 'meta' and is 'none'"),
+    ],
+)
+def test_checkpoint_of_another_configuration_is_not_continued(
+    interrupted, completes, caplog, changes, message
+):
+    settings = merge_layers(interrupted.config.settings(), changes)
+    completes(RunConfig.model_validate(settings), interrupted.directory)
+    assert f"of another run: {message}" in caplog.text
+
+
+def test_checkpoint_of_other_versions_or_code_is_not_continued(
+    interrupted, monkeypatch, caplog, kill
+):
+    found = provenance.versions()
+    for place, name, replaced, message in (
+        (provenance, "versions", lambda: found | {"torch": "9.9"}, "versions.torch was "),
+        (sources, "digest", lambda *paths: "0" * 64, "sources was "),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, replaced)
+            # Before the first checkpoint, so the old one stays.
+            kill(1, interrupted.config, interrupted.directory)
+        assert message in caplog.text
+    caplog.clear()
+    run.run(interrupted.config, interrupted.directory)
+    assert "afresh" not in caplog.text
+
+
+@pytest.mark.parametrize("said", ["often", "-1", "nan", ""])
+def test_a_time_between_checkpoints_that_cannot_be(run_config, tmp_path, monkeypatch, said):
+    monkeypatch.setenv("MACE_RL_CHECKPOINT_SECONDS", said)
+    refusal = f"MACE_RL_CHECKPOINT_SECONDS is {said!r}, but should be a number of seconds"
+    with pytest.raises(run.RunError, match=re.escape(refusal)):
+        run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path)
+
+
+@pytest.mark.parametrize(("cost", "wait"), [(0.01, 10.0), (0.1, 10.0), (0.5, 50.0), (3.0, 300.0)])
+def test_checkpoints_cost_at_most_one_percent(monkeypatch, cost, wait):
+    """Every 10 s, or as seldom as their cost demands; the clock is set by hand."""
+    now = [1000.0]
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    clock = run.Clock(900.0, 2.0, 0.7)  # 100 s before an interruption, 0.7 of them on checkpoints
+    assert clock.elapsed() == 100 and not clock.checkpoint_due()
+    now[0] += 10
+    assert clock.checkpoint_due()
+    with clock.saving():
+        now[0] += cost
+    assert clock.checkpoint_seconds == pytest.approx(0.7 + cost)
+    now[0] = 1010 + wait - 0.001
+    assert not clock.checkpoint_due()
+    now[0] += 0.002
+    assert clock.checkpoint_due()
