@@ -93,7 +93,7 @@ def test_run_json_says_where_the_results_come_from(finished):
     assert found["versions"]["numpy"] == np.__version__
     assert found["versions"]["gymnasium"] == gymnasium.__version__
     assert found["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["sources"] == sources.digest(sources.PACKAGE / "runs" / "run.py")
+    assert found["sources"] == sources.digest("training")
     assert set(found["code"]) == {"commit", "dirty"}
     assert found["machine"]["cores"] == os.cpu_count() and found["machine"]["cpu"]
     assert found["threads"] == 1

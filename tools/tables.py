@@ -29,14 +29,13 @@ import snakemake.script
 from threadpoolctl import threadpool_limits
 
 from mace_rl.config.reading import read_yaml
-from mace_rl.sources import digest
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 # What the workflow and its jobs import, or let be imported, which takes longer than most of the
 # jobs' work: imported once, before the processes of all of them are forked.
 SHARED = (
-    *("gymnasium", "smart_open", "nbformat", "rich.live", "pandas", "seaborn", "fontTools.subset"),
+    *("gymnasium", "smart_open", "nbformat", "pandas", "seaborn", "fontTools.subset"),
     *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
     *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
     *(f"mace_rl.results.{name}" for name in ("claims_text", "comparisons", "pictures", "readings")),
@@ -104,11 +103,10 @@ def run_scripts(jobs: Connection, scripts: Connection) -> None:
 def make_all(studies: dict[str, Any]) -> None:
     """Make the outputs of every study, as many studies at once as there are cores.
 
-    Each in a process forked from this one, which has done what all of them begin with: imports,
-    Snakemake's plugins, and parsing what digests are of.
+    Each in a process forked from this one, which has done what all of them begin with: imports and
+    Snakemake's plugins.
     """
     snakemake.cli.get_argument_parser()
-    digest(*Path("workflow/scripts").glob("*.py"))
     # One thread for each job, as where Snakemake itself starts it: of libraries that are loaded and
     # of those that will be.
     threadpool_limits(1)
