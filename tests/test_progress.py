@@ -64,7 +64,7 @@ def test_the_table(tmp_path: Path) -> None:
     folder.add(told=told(90, 60.0))  # killed, or failed
     folder.add(told="{", record="[")  # being written
     heading, names, *rows = folder.lines()
-    assert heading == "2 of 6 runs done, 2 running, 1 waiting, 1 stopped; about 4 min left"
+    assert heading == "2 of 6 runs done, 2 running, 1 waiting, 1 stopped; about 3 min left"
     assert names == "environment variant seed episode return β steps/s left"
     assert rows == [
         "A ppo 2 50/100 21.5 0.25 1830 60 s",

@@ -162,13 +162,11 @@ def finished(config: RunConfig, directory: Path) -> bool:
     wanted = run_identity(config)
     found = {key: content[key] for key in wanted}
     found["config"] = check(RunConfig, found["config"], str(directory / files.RECORD)).settings()
-    other = [difference(found, wanted | {"sources": found["sources"]})]
-    if found["sources"] != wanted["sources"]:
+    if found != wanted:
         code = " or ".join([*config.references().values(), "mace_rl"])
-        other.append(f"it is of other code, in {code}")
-    if other[1:] or found != wanted:
-        reasons = ", and ".join(reason for reason in other if reason != "no difference")
-        raise ConfigError(f"{directory} holds another finished run: {reasons}; {way_out}")
+        only_code = found | {"sources": wanted["sources"]} == wanted
+        other = f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"
+        raise ConfigError(f"{directory} holds a finished run {other}; {way_out}")
     for path in (directory / name for name in files.RESULTS):
         if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
             raise ConfigError(
