@@ -86,7 +86,7 @@ class Project:
     def __call__(self, command: str) -> tuple[int, str]:
         """Its exit code and what it printed."""
         process = self.start(command, subprocess.PIPE)
-        output, _ = process.communicate(timeout=300)
+        output, _ = process.communicate(timeout=900)
         return process.returncode, output.decode()
 
     def planned(self, options: str = "") -> dict[str, int]:
