@@ -159,7 +159,7 @@ def test_the_examples_in_the_help_texts_work(monkeypatch, tmp_path, caplog, caps
     kept = tmp_path / "reference/runs/CartPole-v1/mace_full/seed0"
     kept.parent.mkdir(parents=True)
     kept.symlink_to(tmp_path / "cartpole_run")  # what the first example makes
-    plan = tmp_path / "results" / "reduced" / "plan.json"  # what the workflow makes
+    plan = tmp_path / "results" / "reduced" / "logs" / "plan.json"  # what the workflow makes
     plan.parent.mkdir(parents=True)
     plan.write_text('{"cores": 2, "runs": []}')
     for name, parser in {"": cli.parser(), **subcommands()}.items():

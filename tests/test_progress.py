@@ -46,7 +46,8 @@ class Folder:
             fcntl.flock(self.locks[-1], fcntl.LOCK_EX)
 
     def lines(self) -> list[str]:
-        file = self.results / "plan.json"
+        file = self.results / "logs" / "plan.json"
+        file.parent.mkdir(exist_ok=True)
         file.write_text(json.dumps(self.plan))
         os.utime(file, (1000, 1000))
         return [" ".join(line.split()) for line in status(self.results)]

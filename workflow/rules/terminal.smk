@@ -50,8 +50,9 @@ def in_short(record):
         record.reason = textwrap.shorten(record.reason, 100, placeholder=" ...")
     elif event == LogEvent.JOB_ERROR:
         record.input = record.output = []
-        last = [line for log in record.log[:1] if os.path.exists(log) for line in open(log)][-1:]
-        said = [record.rule_msg, *(f"its log ends: {line.strip()}" for line in last)]
+        logs = [log for log in map(Path, record.log[:1]) if log.exists()]
+        last = [line for log in logs for line in log.read_text(errors="replace").splitlines()[-1:]]
+        said = [record.rule_msg, *(f"its log ends: {line}" for line in last)]
         record.rule_msg = "; ".join(filter(None, said)) or "it has no log"
     return True
 
@@ -70,6 +71,7 @@ onstart:
     global lock
     lock = occupy(RESULTS)
     planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": plan()}
+    os.makedirs(f"{RESULTS}/logs", exist_ok=True)
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments):
         logger.info(line)
