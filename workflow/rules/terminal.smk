@@ -64,7 +64,9 @@ def plan():
     """The runs that are asked for, of which some are due, for `mace-rl status`."""
     due = set(workflow.dag.needrun_jobs())
     jobs = [job for job in workflow.dag.jobs if job.rule.name == "train"]
-    return [{**job.wildcards_dict, "work": most_work(job.wildcards), "due": job in due} for job in jobs]
+    return [
+        {**job.wildcards_dict, "work": most_work(job.wildcards), "due": job in due} for job in jobs
+    ]
 
 
 onstart:
@@ -80,7 +82,9 @@ onstart:
             "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
         )
     due = sum(run["due"] for run in planned["runs"])
-    logger.info(f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}")
+    logger.info(
+        f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}"
+    )
 
 
 onsuccess:
