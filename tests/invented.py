@@ -1,4 +1,4 @@
-"""Settings, and records, tables and progress that no run has given, for several test files."""
+"""Settings, and records and tables that no run has given, for several test files."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,6 @@ from mace_rl.results.aggregate import SCORED
 from mace_rl.results.claims import CORRELATION
 from mace_rl.results.metrics import Metric, metrics_columns
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
-from mace_rl.runs.progress import Run
 
 SETTINGS = {
     "final_fraction": 0.1,
@@ -110,19 +109,3 @@ def table_for_scores(seeds: dict[str, int]) -> pd.DataFrame:
     for metric in SCORED:
         frame[metric] = draws.normal(300, 50, len(frame)).round(1)
     return frame
-
-
-def reading(episode: int, seconds: float, start: float = 0.0, episodes: int = 100) -> dict:
-    """What a run tells."""
-    told = {"env_steps": 20 * episode, "recent_return": 21.5, "beta": 0.25, "pid": 1}
-    told |= {"seconds": seconds, "start_seconds": start}
-    return {"episode": episode, "episodes": episodes} | told
-
-
-def some_run(seed: int, variant: str = "ppo", env: str = "CartPole-v1", work: float = 1.0) -> Run:
-    """One that nothing has happened to yet."""
-    return Run(env, variant, str(seed), 100, work, "")
-
-
-A, B, C = (some_run(seed) for seed in range(3))
-FULL = some_run(1, "mace_full", work=3.0)

@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 
+import gymnasium
 import pytest
 import yaml
 from hypothesis import example, given, settings
@@ -16,6 +17,7 @@ from snakemake.utils import update_config
 from mace_rl import cli
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
+from mace_rl.runs import run
 
 CONFIG = yaml.safe_load(cli.CONFIG.read_text(encoding="utf-8"))
 
@@ -50,23 +52,16 @@ MISFITS = {
     ),
 }
 # Mistakes in the form of the command, which argparse answers with the usage and its reason.
-MALFORMED = {
-    "no command": [],
-    "unknown command": ["tarin"],
-    "unknown option": ["train", "--environment", "CartPole-v1"],
-    "abbreviated option": ["train", "--var", "ppo"],
-    "nothing else": ["train"],
-    "seed that is text": ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "one"],
-    "seed that is no integer": ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
-    "episodes that are text": ["train", *sum(GOOD.items(), ()), "--out", "x", "--episodes", "1e3"],
-    "option without value": ["train", "--env"],
-    "config without a file": ["train", *sum(GOOD.items(), ()), "--out", "x", "--config"],
-    "unknown engine": ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
-    "verify without folder": ["verify"],
-    "evaluate without folder": ["evaluate", "--episodes", "3"],
-    "watch without folder": ["watch", "--untrained"],
-    "tensorboard without folder": ["tensorboard", "--out", "x"],
-}
+MALFORMED = [
+    [],
+    ["tarin"],
+    ["train", "--var", "ppo"],
+    ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
+    ["train", *sum(GOOD.items(), ()), "--out", "x", "--config"],
+    ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
+    ["verify"],
+    ["status"],
+]
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -124,18 +119,6 @@ def test_an_environment_is_made_as_the_config_says(
     assert call(monkeypatch, "evaluate", str(out), "--episodes", "2") == (0, "")
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-def test_several_files_are_read_over_each_other_in_order(tmp_path, repeated):
-    """Both ways of giving them are the same, and the later file wins."""
-    settings = {"first": "{max_episode_steps: 7, ppo: {epochs: 3}}", "second": "{ppo: {epochs: 2}}"}
-    for name, layer in settings.items():
-        text = f"environment_settings: {{FrozenLake-v1: {layer}}}"
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    for order, epochs in ((["first", "second"], 2), (["second", "first"], 3)):
-        config = config_of(*(tmp_path / name for name in order), repeated=repeated)
-        assert (config.max_episode_steps, config.ppo.epochs) == (7, epochs)
-
-
 @pytest.mark.parametrize("order", [("exploration", "controls"), ("controls", "exploration")])
 def test_runs_of_combined_studies_are_those_of_the_workflow(order):
     """As Snakemake's own function reads the files over each other."""
@@ -148,18 +131,16 @@ def test_runs_of_combined_studies_are_those_of_the_workflow(order):
     assert config_of(*paths, **options) == expected.model_copy(update={"episodes": 3})
 
 
-def config_of(*paths, repeated=False, **changes: str):
-    """The run that `mace-rl train` is asked for with these files, each behind its own --config."""
-    options = sum((GOOD | {"--env": "FrozenLake-v1", "--out": "x"} | changes).items(), ())
-    words = [word for path in paths for word in ("--config", str(path))]
-    if not repeated:
-        words = ["--config", *map(str, paths)]
+def config_of(*paths, **changes: str):
+    """The run that `mace-rl train` is asked for with these files, of which the last wins."""
+    options = sum((GOOD | {"--out": "x"} | changes).items(), ())
+    words = ["--config", str(paths[0]), "--config", *map(str, paths[1:])]
     return cli.run_config(cli.parser().parse_args(["train", *options, *words]))
 
 
-@pytest.mark.parametrize("name", MALFORMED)
-def test_a_malformed_command_is_refused_with_its_reason(name, monkeypatch, capsys):
-    code, _ = call(monkeypatch, *MALFORMED[name])
+@pytest.mark.parametrize("words", MALFORMED, ids=" ".join)
+def test_a_malformed_command_is_refused_with_its_reason(words, monkeypatch, capsys):
+    code, _ = call(monkeypatch, *words)
     assert code == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("mace-rl")
 
@@ -178,6 +159,9 @@ def test_the_examples_in_the_help_texts_work(monkeypatch, tmp_path, caplog, caps
     kept = tmp_path / "reference/runs/CartPole-v1/mace_full/seed0"
     kept.parent.mkdir(parents=True)
     kept.symlink_to(tmp_path / "cartpole_run")  # what the first example makes
+    plan = tmp_path / "results" / "reduced" / "logs" / "plan.json"  # what the workflow makes
+    plan.parent.mkdir(parents=True)
+    plan.write_text('{"cores": 2, "runs": []}')
     for name, parser in {"": cli.parser(), **subcommands()}.items():
         word, program, *words = shlex.split(parser.epilog)
         assert (word, program, words[0]) == ("example:", "mace-rl", name or "train")
@@ -237,9 +221,9 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     assert "finished" in caplog.text
     limited = overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9")
     for change, difference in {
-        ("--seed", "1"): "seed is 0, not 1",
-        ("--engine", "torch"): "engine is 'compiled', not 'torch'",
-        ("--config", limited): "max_episode_steps is None, not 9",
+        ("--seed", "1"): "config.seed was 0 and is 1",
+        ("--engine", "torch"): "config.engine was 'compiled' and is 'torch'",
+        ("--config", limited): "config.max_episode_steps was None and is 9",
     }.items():
         code, message = call(monkeypatch, "train", *options, *change)
         assert code == 1 and difference in message
@@ -249,7 +233,7 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     record["config"]["max_episode_steps"] = 9
     (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
     code, message = call(monkeypatch, "train", *options)
-    assert code == 1 and "max_episode_steps is 9, not None" in message
+    assert code == 1 and "config.max_episode_steps was 9 and is None" in message
     # As an earlier version of this program wrote it: every section, no key that came later.
     del record["config"]["max_episode_steps"], record["config"]["engine"]
     record["config"]["meta"] = CONFIG["training"]["meta"]
@@ -257,11 +241,10 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
     assert call(monkeypatch, "train", *options) == (0, "")
 
 
-DAMAGED = ["episodes.csv", "diagnostics.csv", "agent.pt"]
 OTHERS = {  # what is changed in run.json, and what the message has to name
-    "sources": ("", "other code, in mace_rl"),
-    "versions": ({"numpy": "1.0"}, "other versions (numpy was '1.0' and is '"),
-    "arithmetic": ({"blas": "Zen"}, "other arithmetic (blas was 'Zen' and is '"),
+    "sources": ("", "a finished run of other code, in mace_rl"),
+    "versions": ({"numpy": "1.0"}, "a finished run where versions.numpy was '1.0' and is '"),
+    "arithmetic": ({"blas": "Zen"}, "a finished run where arithmetic.blas was 'Zen' and is '"),
 }
 
 
@@ -272,29 +255,24 @@ def test_results_that_are_damaged_or_of_other_code_are_not_this_run(monkeypatch,
     whole = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     caplog.clear()
 
-    def refused(*expected: str) -> None:
+    def refused(name: str, content: bytes | None, *expected: str) -> None:
+        (tmp_path / name).unlink()
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
         code, message = call(monkeypatch, *words)
+        (tmp_path / name).write_bytes(whole[name])
         assert code == 1 and "\n" not in message and str(tmp_path) in message
         for fragment in (*expected, "choose another --out, or remove the folder"):
             assert fragment in message
 
-    for name in DAMAGED:
-        (tmp_path / name).write_bytes(whole[name][:-1])
-        refused(name, "cut off")
-        (tmp_path / name).unlink()
-        refused(name, "missing")
-        (tmp_path / name).write_bytes(whole[name])
+    for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):
+        refused(name, whole[name][:-1], name, "cut off")
+        refused(name, None, name, "missing")
     record = json.loads(whole["run.json"])
-    together = record.copy()
     for key, (other, expected) in OTHERS.items():
         changed = record[key] | other if isinstance(other, dict) else other
-        together[key] = changed
-        (tmp_path / "run.json").write_text(json.dumps(record | {key: changed}), encoding="utf-8")
-        refused(expected)
-    (tmp_path / "run.json").write_text(json.dumps(together), encoding="utf-8")
-    refused(*(expected for _, expected in OTHERS.values()))
+        refused("run.json", json.dumps(record | {key: changed}).encode(), expected)
     assert not caplog.text  # neither trained nor called finished
-    (tmp_path / "run.json").write_bytes(whole["run.json"])
     assert call(monkeypatch, *words) == (0, "") and "finished" in caplog.text
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == whole
 
@@ -304,9 +282,38 @@ def test_a_run_is_finished_for_another_process_too(tmp_path):
     """Which has loaded fewer libraries when it looks than training had when it ended."""
     words = ["train", *sum((GOOD | {"--out": str(tmp_path)}).items(), ())]
     for expected in ("finished: ", "holds this run already, finished"):
-        command = [sys.executable, "-m", "mace_rl.cli", *words]
+        command = [sys.executable, "-m", "mace_rl", *words]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0 and expected in done.stderr, done.stderr
+
+
+class Breaks(gymnasium.Wrapper):
+    """CartPole whose seventh step raises, in the second episode."""
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.make("CartPole-v1").unwrapped)
+        self.resets = self.steps = 0
+
+    def reset(self, **options):
+        self.resets, self.steps = self.resets + 1, 0  # one more than there are episodes
+        return self.env.reset(**options)
+
+    def step(self, action):
+        self.steps += 1
+        observation, reward, *_, info = self.env.step(action)
+        if (self.resets, self.steps) == (3, 7):
+            raise ZeroDivisionError("a mistake of its own")
+        return observation, reward, False, self.steps == 8, info
+
+
+def test_an_exception_of_an_environment_says_when_it_was(register, run_config, tmp_path):
+    config = run_config(register("Breaks-v0", Breaks), "ppo", 3, episodes=4)
+    with pytest.raises(ZeroDivisionError, match="a mistake of its own") as caught:
+        run.run(config, tmp_path)
+    assert caught.value.__notes__ == [
+        "in step 7 of an episode of Breaks-v0",
+        "in Breaks-v0 ppo seed 3, episode 2",
+    ]
 
 
 UNFIT = {  # an option's value, and what would be right
@@ -331,7 +338,7 @@ def test_a_mistaken_value_of_an_option_is_named_alone(monkeypatch, tmp_path, com
     assert call(monkeypatch, name, str(tmp_path), option, value) == (1, expected)
 
 
-@pytest.mark.parametrize("command", subcommands())
+@pytest.mark.parametrize("command", ["train", "verify"])
 def test_only_training_resumes_after_an_interruption(monkeypatch, caplog, command):
     def interrupted(_) -> None:
         raise KeyboardInterrupt

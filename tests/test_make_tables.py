@@ -83,7 +83,9 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     named += "reference/tables/small/metrics.csv, reference/tables/small/README.md"
     assert tabulate("--check") == (made, named)
     (kept / "metrics.csv").write_bytes(metrics)
-    (kept / "README.md").write_text(readme)
+    (kept / "README.md").write_text("stale")
+    assert tabulate() == ("renewed: reference/tables/small/README.md\n" + made, "")
+    assert (kept / "README.md").read_text() == readme
     assert tabulate("--check") == (made, "")
 
     studies.write_text(yaml.safe_dump({"small": wanted, "bad": wanted | {"config": ["seeds=[2]"]}}))

@@ -71,6 +71,7 @@ def test_run_json_says_where_the_results_come_from(finished):
     for module in (torch, np, gymnasium):
         assert found["versions"][module.__name__] == module.__version__
     assert found["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert found["sources"] == sources.digest("training")
     assert set(found["code"]) == {"commit", "dirty"}
     assert found["machine"]["cores"] == os.cpu_count() and found["machine"]["cpu"]
     assert found["threads"] == 1 and found["interruptions"] == []

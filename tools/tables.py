@@ -5,9 +5,9 @@
 
 The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
 the outputs that reference/studies.yaml names, and README.md: tables.md with the pictures that are
-among these. They are compared with those in reference/tables. New ones are kept there; with --check
-that one is missing is a mistake too. With --report only the page of one study is made, and not
-compared.
+among these. They are compared with those in reference/tables. New ones are kept there, and README.md,
+which only shows the others, is renewed; with --check that one is missing, or a README.md another, is
+a mistake too. With --report only the page of one study is made, and not compared.
 """
 
 import argparse
@@ -31,14 +31,13 @@ import snakemake.script
 from threadpoolctl import threadpool_limits
 
 from mace_rl.config.reading import read_yaml
-from mace_rl.sources import digest
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 # What the workflow and its jobs import, or let be imported, which takes longer than most of the
 # jobs' work: imported once, before the processes of all of them are forked.
 SHARED = (
-    *("gymnasium", "smart_open", "nbformat", "rich.live", "pandas", "seaborn", "fontTools.subset"),
+    *("gymnasium", "smart_open", "nbformat", "pandas", "seaborn", "fontTools.subset"),
     *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
     *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
     *(f"mace_rl.results.{name}" for name in ("comparisons", "pages", "pictures", "readings")),
@@ -107,11 +106,10 @@ def run_scripts(jobs: Connection, scripts: Connection) -> None:
 def make_all(studies: dict[str, Any]) -> None:
     """Make the outputs of every study, as many studies at once as there are cores.
 
-    Each in a process forked from this one, which has done what all of them begin with: imports,
-    Snakemake's plugins, and parsing what digests are of.
+    Each in a process forked from this one, which has done what all of them begin with: imports and
+    Snakemake's plugins.
     """
     snakemake.cli.get_argument_parser()
-    digest(*Path("workflow/scripts").glob("*.py"))
     # One thread for each job, as where Snakemake itself starts it: of libraries that are loaded and
     # of those that will be.
     threadpool_limits(1)
@@ -145,16 +143,18 @@ def write_readme(name: str, outputs: list[str]) -> None:
 
 
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
-    """The outputs that are not those in `EXPECTED`; new ones go there, unless `check`."""
+    """The outputs that are not those in `EXPECTED`, where new ones and pages go, unless `check`."""
     different = []
     for output in outputs:
         made, expected = MADE / name / output, EXPECTED / name / output
-        if not expected.exists() and not check:
-            expected.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(made, expected)
-            print(f"new: {expected}")
-        elif not expected.exists() or made.read_bytes() != expected.read_bytes():
+        if expected.exists() and made.read_bytes() == expected.read_bytes():
+            continue
+        if check or (expected.exists() and output != README):
             different.append(str(expected))
+            continue
+        print(f"{'renewed' if expected.exists() else 'new'}: {expected}")
+        expected.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(made, expected)
     return different
 
 
@@ -163,7 +163,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], epilog="example: python -m tools.tables --check"
     )
-    parser.add_argument("--check", action="store_true", help="keep nothing new")
+    parser.add_argument("--check", action="store_true", help="keep and renew nothing")
     parser.add_argument("--report", metavar="STUDY", help="make only this study's page")
     arguments = parser.parse_args()
     check, only = arguments.check, arguments.report

@@ -3,7 +3,9 @@
 import argparse
 import logging
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mace_rl import files
 from mace_rl.config.run import RunConfig
@@ -26,19 +28,24 @@ def parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     commands = top.add_subparsers(dest="command", required=True)
-    train = commands.add_parser(
+
+    def command(name: str, summary: str, does: str, example: str) -> Callable[..., Any]:
+        epilog = f"example: mace-rl {name} {example}"
+        return commands.add_parser(
+            name, help=summary, description=does, epilog=epilog, allow_abbrev=False
+        ).add_argument
+
+    add = command(
         "train",
-        allow_abbrev=False,
-        help="carry out one training run",
-        description="Carry out one training run; the same command resumes it if interrupted.",
-        epilog="example: mace-rl train --env CartPole-v1 --variant mace_full --seed 0 "
-        "--episodes 100 --out cartpole_run",
+        "carry out one training run",
+        "Carry out one training run; the same command resumes it if interrupted.",
+        "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
     )
-    train.add_argument("--env", required=True, help="a registered Gymnasium id")
-    train.add_argument("--variant", required=True, help="one of the config's variant_settings")
-    train.add_argument("--seed", required=True, type=int)
-    train.add_argument("--episodes", type=int, help="instead of the config's budget")
-    train.add_argument(
+    add("--env", required=True, help="a registered Gymnasium id")
+    add("--variant", required=True, help="one of the config's variant_settings")
+    add("--seed", required=True, type=int)
+    add("--episodes", type=int, help="instead of the config's budget")
+    add(
         "--config",
         type=Path,
         nargs="+",
@@ -47,62 +54,70 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="YAML files read over the project's config.yaml, one after the other",
     )
-    train.add_argument(
+    add(
         "--engine",
         choices=["compiled", "torch"],
         help="of every network: compiled (default) or plain PyTorch, slower, to check it by",
     )
-    train.add_argument("--out", required=True, type=Path, help="folder for the results")
-    evaluate = commands.add_parser(
-        "evaluate",
-        allow_abbrev=False,
-        help="play episodes with a trained agent",
-        description="Play episodes with a trained agent and print its returns.",
-        epilog="example: mace-rl evaluate cartpole_run --episodes 20 --deterministic",
+    add("--out", required=True, type=Path, help="folder for the results")
+    add = command(
+        "status",
+        "how far the workflow's runs are",
+        "Print how far the runs are that the workflow began, and about when they will be done.",
+        "results/reduced",
     )
-    _play(evaluate, episodes=100)
-    watch = commands.add_parser(
-        "watch",
-        allow_abbrev=False,
-        help="film a trained agent, as a GIF",
-        description="Write an animated GIF of the first episodes that `mace-rl evaluate` plays.",
-        epilog="example: mace-rl watch cartpole_run --out cartpole.gif",
-    )
-    _play(watch, episodes=1)
-    watch.add_argument(
-        "--untrained", action="store_true", help="film the agent as it was before training"
-    )
-    watch.add_argument(
-        "--seconds", type=float, default=10.0, help="of each episode at most (default: 10)"
-    )
-    watch.add_argument("--width", type=int, default=300, help="in pixels (default: 300)")
-    watch.add_argument(
+    add("folder", type=Path, help="the workflow's results folder")
+    for name, summary, does, example, episodes in (
+        (
+            "evaluate",
+            "play episodes with a trained agent",
+            "Play episodes with a trained agent and print its returns.",
+            "cartpole_run --episodes 20 --deterministic",
+            100,
+        ),
+        (
+            "watch",
+            "film a trained agent, as a GIF",
+            "Write an animated GIF of the first episodes that `mace-rl evaluate` plays.",
+            "cartpole_run --out cartpole.gif",
+            1,
+        ),
+    ):
+        add = command(name, summary, does, example)
+        add("folder", type=Path, help="of a finished run")
+        add("--episodes", type=int, default=episodes, help=f"how many (default: {episodes})")
+        add("--seed", type=int, default=0, help="of the episodes (default: 0)")
+        add(
+            "--deterministic",
+            action="store_true",
+            help="take the most probable action, or the mean, instead of a sample",
+        )
+    add("--untrained", action="store_true", help="film the agent as it was before training")
+    add("--seconds", type=float, default=10.0, help="of each episode at most (default: 10)")
+    add("--width", type=int, default=300, help="in pixels (default: 300)")
+    add(
         "--out",
         type=Path,
         help="a GIF file (default: watch.gif or watch_untrained.gif in the folder)",
     )
-    tensorboard = commands.add_parser(
+    add = command(
         "tensorboard",
-        allow_abbrev=False,
-        help="write what runs recorded as TensorBoard's events",
-        description="Write what runs recorded, finished or not, as event files for TensorBoard; "
-        "again later, to bring them up to date.",
-        epilog="example: mace-rl tensorboard cartpole_run --out events",
+        "write what runs recorded as TensorBoard's events",
+        "Write what runs recorded, finished or not, as event files for TensorBoard; again later, "
+        "to bring them up to date.",
+        "cartpole_run --out events",
     )
-    tensorboard.add_argument("folder", type=Path, help="of a run, or with runs below it")
-    tensorboard.add_argument(
-        "--out", type=Path, help="folder for the event files (default: beside the records)"
-    )
-    verify = commands.add_parser(
+    add("folder", type=Path, help="of a run, or with runs below it")
+    add("--out", type=Path, help="folder for the event files (default: beside the records)")
+    add = command(
         "verify",
-        allow_abbrev=False,
-        help="repeat kept runs and compare to the bit",
-        description="Repeat runs that were kept and say whether they come out the same.",
-        epilog="example: mace-rl verify reference --sample 1",
+        "repeat kept runs and compare to the bit",
+        "Repeat runs that were kept and say whether they come out the same.",
+        "reference --sample 1",
     )
-    verify.add_argument("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
-    verify.add_argument("--sample", type=int, help="how many, chosen at random (default: all)")
-    verify.add_argument("--sample-seed", type=int, default=0, help="which ones (default: 0)")
+    add("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
+    add("--sample", type=int, help="how many, chosen at random (default: all)")
+    add("--sample-seed", type=int, default=0, help="which ones (default: 0)")
     return top
 
 
@@ -136,40 +151,27 @@ def finished(config: RunConfig, directory: Path) -> bool:
     Raises `ConfigError` if they are damaged, of another run, or of other code, versions or
     arithmetic, as a checkpoint of those is not continued.
     """
-    record = directory / files.RECORD
-    if not record.exists():
+    if not (directory / files.RECORD).exists():
         return False
     way_out = "choose another --out, or remove the folder"
-    content = read_record(record)
-    found = check(RunConfig, content["config"], str(record)).settings()
-    wanted = config.settings()
-    different = [key for key in wanted | found if found.get(key) != wanted.get(key)]
-    if different:
-        key = different[0]
-        raise ConfigError(
-            f"{directory} holds a finished run whose {key} is {found.get(key)!r}, "
-            f"not {wanted.get(key)!r}; {way_out}"
-        )
+    content = read_record(directory / files.RECORD)
+    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
+    from mace_rl.runs.checkpoint import difference
+    from mace_rl.runs.run import run_identity
+
+    wanted = run_identity(config)
+    found = {key: content[key] for key in wanted}
+    found["config"] = check(RunConfig, found["config"], str(directory / files.RECORD)).settings()
+    if found != wanted:
+        code = " or ".join([*config.references().values(), "mace_rl"])
+        only_code = found | {"sources": wanted["sources"]} == wanted
+        other = f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"
+        raise ConfigError(f"{directory} holds a finished run {other}; {way_out}")
     for path in (directory / name for name in files.RESULTS):
         if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
             raise ConfigError(
                 f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {way_out}"
             )
-    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
-    from mace_rl.runs.checkpoint import difference
-    from mace_rl.runs.run import run_identity
-
-    now = run_identity(config)
-    other = [
-        f"other {key} ({difference(content[key], now[key])})"
-        for key in ("versions", "arithmetic")
-        if content[key] != now[key]
-    ]
-    if content["sources"] != now["sources"]:
-        code = " or ".join([*config.references().values(), "mace_rl"])
-        other.insert(0, f"other code, in {code}")
-    if other:
-        raise ConfigError(f"{directory} holds a finished run of {', '.join(other)}; {way_out}")
     return True
 
 
@@ -187,18 +189,12 @@ def train(arguments: argparse.Namespace) -> None:
     logger.info("finished: %s", arguments.out / files.EPISODES)
 
 
-def _play(parser: argparse.ArgumentParser, episodes: int) -> None:
-    """The arguments of what plays episodes with a trained agent, `episodes` by default."""
-    parser.add_argument("folder", type=Path, help="of a finished run")
-    parser.add_argument(
-        "--episodes", type=int, default=episodes, help=f"how many (default: {episodes})"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    parser.add_argument(
-        "--deterministic",
-        action="store_true",
-        help="take the most probable action, or the mean, instead of a sample",
-    )
+def status(arguments: argparse.Namespace) -> None:
+    """`mace-rl status`."""
+    from mace_rl.runs import progress
+
+    for line in progress.status(arguments.folder):
+        print(line)
 
 
 def _require_playable(arguments: argparse.Namespace) -> None:
@@ -273,6 +269,7 @@ def main() -> None:
     arguments = parser().parse_args()
     commands = {
         "train": train,
+        "status": status,
         "evaluate": evaluate,
         "watch": watch,
         "tensorboard": tensorboard,

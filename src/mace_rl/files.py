@@ -13,6 +13,7 @@ EVENTS = "events.out.tfevents.mace-rl"  # for TensorBoard, where they are asked 
 CHECKPOINT = "checkpoint.pt"  # while it runs: from which it resumes ...
 PROGRESS = "progress.json"  # ... and for whoever watches
 LOCK = ".lock"  # held by the process that trains here; stays
+PLAN = "logs/plan.json"  # of a results folder: its runs, as the workflow began them
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> None:

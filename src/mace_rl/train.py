@@ -72,13 +72,16 @@ class Trainer:
                 update = self.improve(rollout)
                 done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
                 self.diagnostics.append(diagnose(done, rollout, update, credit))
-            except NonFiniteError as error:
+            except Exception as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
                 played = len(self.records)
                 where = (
                     f"the update after episode {played}" if updating else f"episode {played + 1}"
                 )
-                raise NonFiniteError(f"{run}, {where}: {error}") from None
+                if isinstance(error, NonFiniteError):
+                    raise NonFiniteError(f"{run}, {where}: {error}") from None
+                error.add_note(f"in {run}, {where}")
+                raise
             yield self.records[start:]
 
     def collect(self) -> list[Experience]:

@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import sys
-from functools import cache
 from pathlib import Path
 
 import gymnasium
@@ -110,19 +109,15 @@ def queue_entry(wildcards):
     return queueing.entry(minutes(wildcards), workflow.group_settings.group_components)
 
 
-@cache
-def digest_of(script, *own):
-    """`digest` of a script and files; asked for once for each run, of a thousand alike."""
-    return digest(Path(workflow.basedir, "workflow", "scripts", script), *own)
-
-
 def code(script, settings=None):
-    """Digest of a script and of all that it imports of mace_rl, for the `params:` of its rule.
+    """Digest of a script and of the code of mace_rl that it can use, for the `params:` of its rule.
 
     With `settings` that name code of the user's own (`references()`), of that too. A change of code,
     by content, is thus a reason to run the job again. As an input it would not be: Snakemake goes by
     an input's time stamp first, and records what it contained when the job ended, so code that was
     edited meanwhile would pass for the code that ran.
     """
+    part = {"train.py": "training", "report.py": "everything"}.get(script, "evaluation")
+    scripts = [Path(workflow.basedir, "workflow", "scripts", name) for name in (script, "job.py")]
     named = settings.references() if settings else {}
-    return digest_of(script, *(source_file(reference, key) for key, reference in named.items()))
+    return digest(part, *scripts, *(source_file(name, key) for key, name in named.items()))

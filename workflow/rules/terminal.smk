@@ -1,14 +1,14 @@
-# Around the jobs: one Snakemake at a time in a results folder, and a terminal that shows progress.
+# Around the jobs: one Snakemake at a time in a results folder, and what the terminal says of them.
 
 import fcntl
 import platform
-from types import SimpleNamespace
+import textwrap
 
-from snakemake.logging import logger
-from snakemake_logger_plugin_mace_rl import Run, Study
+from snakemake.logging import LogEvent, logger
 
-# A job ends when the Snakemake that started it does, even by SIGKILL: workflow/scripts/job.py. On a
-# cluster that is the Snakemake on the node, which reads this too, and not the one that submitted.
+# What Snakemake lacks (9.27.1): when it is killed its jobs go on, unseen and in the way of the next
+# one's. So they end with it: workflow/scripts/job.py. On a cluster that is the Snakemake on the
+# node, which reads this too, and not the one that submitted.
 os.environ.update(MACE_RL_SNAKEMAKE_PID=str(os.getpid()))
 # There several runs share a job. If that ends in the middle, Snakemake deletes the results of those
 # that were done, too, and they come back from their last checkpoints.
@@ -19,11 +19,12 @@ if workflow.remote_exec:
 def occupy(folder):
     """Keep other Snakemakes out of `folder` as long as this process lives.
 
-    Snakemake's own lock, which profiles/default/config.yaml turns off, outlives a kill.
+    What Snakemake lacks (9.27.1): its own lock outlives a kill, and the same command is then refused
+    until `--unlock`. So profiles/default/config.yaml turns it off.
     """
     try:
         os.makedirs(folder, exist_ok=True)
-        lock = open(f"{folder}/.lock", "a+", encoding="utf-8")
+        lock = open(f"{folder}/{files.LOCK}", "a+", encoding="utf-8")
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
@@ -36,30 +37,54 @@ def occupy(folder):
     return lock
 
 
-def watched_runs():
-    """Every run of the study, as what the terminal shows needs it."""
-    for env, variant, seed, episodes in TRAININGS:
-        wildcards = {"env": env, "variant": variant, "seed": str(seed)}
-        work = most_work(SimpleNamespace(**wildcards))
-        yield Run(*wildcards.values(), episodes, work, RUN.format(**wildcards))
+def in_short(record):
+    """Let Snakemake say in a line which job begins, and why one failed.
+
+    What it lacks (9.27.1): it lists all inputs and outputs of a job, some thousand files for the
+    metrics of a study, or with `quiet: rules` not even the jobs that failed; and of a failed script
+    it says that there is a log, not what is in it.
+    """
+    event = getattr(record, "event", None)
+    if event == LogEvent.JOB_INFO and not workflow.dryrun:
+        record.rule_msg = " ".join([record.rule_name, *record.wildcards.values()])
+        record.reason = textwrap.shorten(record.reason, 100, placeholder=" ...")
+    elif event == LogEvent.JOB_ERROR:
+        record.input = record.output = []
+        logs = [log for log in map(Path, record.log[:1]) if log.exists()]
+        last = [line for log in logs for line in log.read_text(errors="replace").splitlines()[-1:]]
+        said = [record.rule_msg, *(f"its log ends: {line}" for line in last)]
+        record.rule_msg = "; ".join(filter(None, said)) or "it has no log"
+    return True
+
+
+logger.addFilter(in_short)
+
+
+def plan():
+    """The runs that are asked for, of which some are due, for `mace-rl status`."""
+    due = set(workflow.dag.needrun_jobs())
+    jobs = [job for job in workflow.dag.jobs if job.rule.name == "train"]
+    return [
+        {**job.wildcards_dict, "work": most_work(job.wildcards), "due": job in due} for job in jobs
+    ]
 
 
 onstart:
     global lock
     lock = occupy(RESULTS)
-    # Snakemake tells its loggers how many jobs there will be, but not which.
-    jobs = [job for job in workflow.dag.needrun_jobs() if job.rule.name == "train"]
-    due = [tuple(job.wildcards_dict.values()) for job in jobs]
-    cores = workflow.cores if workflow.local_exec else None
-    watched = Study(watched_runs(), due, cores, workflow.execution_settings.retries)
+    planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": plan()}
+    os.makedirs(f"{RESULTS}/logs", exist_ok=True)
+    files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments):
         logger.info(line)
     if HAS_PAPERS and not TESTS_CLAIMS:
         logger.info(
             "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
         )
-    told = {"study": watched, "quietness": Quietness.PROGRESS}
-    logger.info(f"{len(due)} of {len(RUNS)} runs to train", extra=told)
+    due = sum(run["due"] for run in planned["runs"])
+    logger.info(
+        f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}"
+    )
 
 
 onsuccess:

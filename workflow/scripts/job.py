@@ -1,4 +1,4 @@
-"""What a job does around its work: all output goes to its log, and what went wrong in one line."""
+"""What a job does around its work: all output goes to its log, which ends with what went wrong."""
 
 import logging
 import os
@@ -21,10 +21,12 @@ def job(title: str, log: str) -> Iterator[None]:
     """Carry out the body as the job `title`.
 
     Standard output and error, those of compiled libraries too, are appended to the file `log`. If
-    the body raises, the process exits with 1, and there too are the traceback and, in a line that
-    src/snakemake_logger_plugin_mace_rl shows, the reason.
+    the body raises, the process exits with 1; then the log has the traceback and, in its last line,
+    which workflow/rules/terminal.smk shows, the reason.
     """
-    _end_with_snakemake()
+    # Without this a training goes on unseen when Snakemake is killed.
+    if "MACE_RL_SNAKEMAKE_PID" in os.environ:
+        threading.Thread(target=_end_with_snakemake, daemon=True).start()
     with open(log, "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -45,24 +47,16 @@ def job(title: str, log: str) -> Iterator[None]:
         yield
         arithmetic.require()  # of the libraries that the body loaded
     except Exception as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        logger.exception("%s failed: %s", title, reason)
+        logger.exception("%s failed", title)
+        said = "; ".join([str(error), *getattr(error, "__notes__", ())])
+        reason = f"{type(error).__name__}: {' '.join(said.split())}"
+        logger.info("%s failed: %s", title, reason)
         sys.exit(1)
     logger.info("%s: done in %.1f s", title, time.monotonic() - start)
 
 
 def _end_with_snakemake() -> None:
-    """Let this process end with the Snakemake that started it.
-
-    Without this a training goes on unseen when Snakemake is killed, and is in the way of the next.
-    """
-    snakemake_pid = os.environ.get("MACE_RL_SNAKEMAKE_PID")
-    if snakemake_pid:
-        watch = threading.Thread(target=_watch, args=(int(snakemake_pid),), daemon=True)
-        watch.start()
-
-
-def _watch(pid: int) -> None:
+    pid = int(os.environ["MACE_RL_SNAKEMAKE_PID"])
     while True:
         time.sleep(PATIENCE)
         try:

@@ -66,7 +66,11 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
         action: Any
         action, log_prob = policy.act(vector, noise[t])
         env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
-        observation, reward, terminated, truncated, _ = env.step(env_action)
+        try:
+            observation, reward, terminated, truncated, _ = env.step(env_action)
+        except Exception as error:
+            error.add_note(f"in step {t + 1} of an episode of {environment.name}")
+            raise
         actions[t], log_probs[t], rewards[t] = action, log_prob, reward
         t += 1
         vector = observations[t]

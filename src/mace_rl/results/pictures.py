@@ -17,11 +17,11 @@ from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
 from mace_rl.results.metrics import METRICS
 from mace_rl.results.paper import FIXED, FULL, PPO
 from mace_rl.results.statistics import mean_interval
+from mace_rl.results.tables import SOLVED
 
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
     from matplotlib.figure import Figure
 
-SOLVED = 0.9  # of a seed's last episodes: then it has solved the task
 CONSTANT, LEARNED, OTHER = "constant", "learned", "other"
 METRIC_LABELS = {metric.name: metric.label for metric in METRICS}
 SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β"}  # the paper's variants

@@ -35,10 +35,8 @@ class ProvenanceError(Refusal, ValueError):
 
 def sources_of(config: RunConfig) -> str:
     """The digest of all code that a run depends on, the user's own included."""
-    return sources.digest(
-        sources.PACKAGE / "runs" / "run.py",
-        *(source_file(reference, key) for key, reference in config.references().items()),
-    )
+    own = (source_file(reference, key) for key, reference in config.references().items())
+    return sources.digest("training", *own)
 
 
 def file_digest(path: Path) -> str:

@@ -215,15 +215,21 @@ def locked(descriptor: int) -> bool:
 
 
 def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
-    """How far it is."""
+    """How far it is; `left` are the seconds to its end if its episodes stay as long as the last."""
     records = trainer.records
+    recent = records[-50:]
+    seconds = clock.elapsed()
+    speed = records[-1].env_steps / max(1e-9, seconds - clock.start_seconds)
+    to_come = trainer.config.episodes - len(records)
     return {
         "episode": len(records),
         "episodes": trainer.config.episodes,
-        "recent_return": float(np.mean([record.extrinsic_return for record in records[-50:]])),
+        "recent_return": float(np.mean([record.extrinsic_return for record in recent])),
         "beta": records[-1].beta,
         "env_steps": records[-1].env_steps,
-        "seconds": clock.elapsed(),
+        "steps_per_second": speed,
+        "left": to_come * float(np.mean([record.length for record in recent])) / speed,
+        "seconds": seconds,
         "start_seconds": clock.start_seconds,
         "pid": os.getpid(),
     }

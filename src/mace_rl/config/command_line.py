@@ -1,0 +1,29 @@
+"""What is looked at of Snakemake's command line before Snakemake reads it: profiles/default."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from mace_rl.config.reading import read_yaml
+from mace_rl.config.section import ConfigError
+
+
+def checked() -> argparse.Namespace:
+    """The `cores` and `configfile` of the command; exits with one line where they are wrong."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--cores", "-c", nargs="?", const="all")
+    parser.add_argument("--jobs", "-j", nargs="?", const="all")
+    parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", default=[])
+    parser.add_argument("--config", "-C", nargs="*", action="append")  # not short for --configfile
+    given, _ = parser.parse_known_args()
+    try:
+        for file in given.configfile:
+            read_yaml(Path(file))
+        if given.cores and given.jobs and given.cores != given.jobs:
+            raise ConfigError(
+                f"-j {given.jobs} and --cores {given.cores} contradict each other: give one of them"
+            )
+    except ConfigError as error:
+        sys.exit(f"Error in the configuration: {error}")
+    given.cores = given.cores or given.jobs
+    return given
