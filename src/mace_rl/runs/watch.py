@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl import files
-from mace_rl.agent.policy import ActingPolicy
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.environments.environment import Environment, nothing_printed
@@ -111,12 +110,14 @@ def film(
     The untrained agent is the same one before training: its initial weights, by the run's seed.
     Raises what `read_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
-    config = check(
-        RunConfig, read_record(directory / files.RECORD)["config"], str(directory / files.RECORD)
-    )
-    environment, policy = (
-        _untrained(config, deterministic) if untrained else load_acting(directory, deterministic)
-    )
+    record = directory / files.RECORD
+    config = check(RunConfig, read_record(record)["config"], str(record))
+    if untrained:
+        trainer = Trainer(config)
+        environment, ppo = trainer.environment, trainer.ppo
+        policy = acting(ppo.policy, *ppo.normalisation(), deterministic)
+    else:
+        environment, policy = load_acting(directory, deterministic)
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):
@@ -164,10 +165,3 @@ def gif(shown: Film) -> bytes:
         loop=0,
     )
     return file.getvalue()
-
-
-def _untrained(config: RunConfig, deterministic: bool) -> tuple[Environment, ActingPolicy]:
-    """What `load_acting` gives, with the policy that the run began with."""
-    trainer = Trainer(config)
-    ppo = trainer.ppo
-    return trainer.environment, acting(ppo.policy, *ppo.normalisation(), deterministic)
