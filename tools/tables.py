@@ -5,9 +5,9 @@
 
 The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
 the outputs that reference/studies.yaml names, and README.md: tables.md with the pictures that are
-among these. They are compared with those in reference/tables. New ones are kept there, and README.md,
-which only shows the others, is renewed; with --check that one is missing, or a README.md another, is
-a mistake too. With --report only the page of one study is made, and not compared.
+among these. They are compared with those in reference/tables. New ones are kept there, and
+README.md, which only shows the others, is renewed; with --check both are mistakes. With --report
+only the page of one study is made, and not compared.
 """
 
 import argparse

@@ -1,21 +1,17 @@
 # The paper's tables, whether their differences are more than chance, and all of it on one page.
 
 
-def supplementary(*names):
-    """These CSV files, with their captions in Snakemake's report."""
-    return {
-        name: report(
-            f"{RESULTS}/{name}.csv", caption=f"../report/{name}.rst", category="Supplement"
-        )
-        for name in names
-    }
+SUPPLEMENT = {
+    name: report(f"{RESULTS}/{name}.csv", caption=f"../report/{name}.rst", category="Supplement")
+    for name in ("supplement", "comparisons", "aggregate", *REGRET)
+}
 
 
 rule tables:
     input:
         f"{RESULTS}/metrics.csv",
     output:
-        **supplementary("supplement", "comparisons", "aggregate", *REGRET),
+        **SUPPLEMENT,
         table1=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"),
         table1_tex=report(
             f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"
