@@ -20,8 +20,8 @@ unexport CDPATH PYTHONHOME PYTHONPATH PIP_PREFIX PIP_REQUIRE_HASHES PIP_TARGET P
 # A command inside the environment. `python -m` also works where the folder's name has a space.
 IN_VENV := PATH="$$PWD/.venv/bin:$$PATH" .venv/bin/python -m
 SNAKEMAKE := $(IN_VENV) snakemake --cores $(CORES)
-# Each process of the tests takes some 400 MB. What shares a finished study stays in one of them.
-PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxprocesses 8 --dist loadgroup
+# Each process of the tests takes some 400 MB.
+PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxprocesses 8
 
 # $(call one_of,NAME,VALUE): stop where the variable has another value.
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))

@@ -33,6 +33,21 @@ CONFIG = Path(__file__).parents[1] / "config.yaml"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """What shares a finished study stays in one process; all else goes where there is time.
+
+    pytest-xdist's marks for groups (3.8) do nothing under pytest 9.2.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByStudy(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return file if Path(file).name in ("test_workflow.py", "test_report.py") else nodeid
+
+    return ByStudy(config, log)
+
+
 @pytest.fixture(scope="session")
 def study() -> Study:
     """The paper's study, as `config.yaml` has it."""

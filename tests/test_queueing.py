@@ -17,7 +17,7 @@ PROFILE = ROOT / "profiles" / "slurm" / "config.yaml"
 
 def test_snakemake_knows_every_key_of_the_profile() -> None:
     _, arguments = parse_args(["--workflow-profile", str(PROFILE), "all"])
-    assert arguments.executor == "slurm" and arguments.logger == ["mace-rl"]
+    assert arguments.executor == "slurm"
     assert arguments.retries == 3 and arguments.cores == 1 and arguments.slurm_requeue
     sizes = arguments.group_components
     assert sizes == {f"runs_{size}": size for size in sizes.values()}

@@ -213,12 +213,11 @@ def test_a_process_of_its_own_is_killed_and_resumed_by_another(
     """And while it lives, a second process in its folder is refused.
 
     It has one thread, whatever the environment says, in every library, NumPy's BLAS and SciPy's
-    among them. A change in any module that it has imported, or in the user's own, makes its
-    checkpoint one of another code.
+    among them. A change in any module that it has imported makes its checkpoint one of another
+    code.
     """
     monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)
-    ppo = {"network": LAYER_NORM}
-    config = run_config("HopperBulletEnv-v0", "mace_full", 5, episodes=20, ppo=ppo)
+    config = run_config("HopperBulletEnv-v0", "mace_full", 5, episodes=20)
     directory = tmp_path / "Läufe mit Leerzeichen"
     command = [sys.executable, "-c", CHILD, config.model_dump_json(), str(directory)]
     environment = {**os.environ, "MACE_RL_CHECKPOINT_SECONDS": "0"}
@@ -236,12 +235,8 @@ def test_a_process_of_its_own_is_killed_and_resumed_by_another(
     assert process.returncode == -signal.SIGKILL
     assert {"numpy", "scipy"} < {Path(library).parts[-2].partition(".")[0] for library in threads}
     assert set(threads.values()) == {1}
-    with monkeypatch.context() as patched:
-        covered, read = set(), Path.read_bytes
-        patched.setattr(Path, "read_bytes", lambda path: (covered.add(path), read(path))[1])
-        run.run_identity(config)
-    assert {*map(Path, imported), Path(__file__).with_name("shared.py")} <= covered
-    assert {path.name for path in covered} >= {"train.py", "ppo.py", "run.py", "__init__.py"}
+    assert {*map(Path, imported)} <= {*sources.files("training")}
+    assert {Path(name).name for name in imported} >= {"train.py", "ppo.py", "run.py"}
     with caplog.at_level(logging.INFO):
         assert len(completes(config, directory)["interruptions"]) == 1
     assert 0 < episode < 20 and "resuming after episode" in caplog.text

@@ -7,7 +7,6 @@ the rooms that it works in, as they are when it is planned.
 """
 
 import hashlib
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -31,14 +30,14 @@ NO_PART = {
 SHARED = ("results/__init__.py", "results/records.py")
 
 
-@cache
 def digest(part: str, *own: Path) -> str:
     """SHA-256 over names and contents of what "training", "evaluation" or "everything" depends on.
 
     own: files beside this package that count too, such as a script or code of the user's own, but
     not what they import in their turn.
     """
-    return _digest([*files(part), *own])
+    lines = sorted([*_lines(part), *map(_line, own)])
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def files(part: str) -> list[Path]:
@@ -52,9 +51,13 @@ def files(part: str) -> list[Path]:
     )
 
 
-def _digest(paths: Iterable[Path]) -> str:
-    lines = [f"{_label(file)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n" for file in paths]
-    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+@cache  # of code that is imported, and so stays in this process what it was
+def _lines(part: str) -> list[str]:
+    return [_line(file) for file in files(part)]
+
+
+def _line(file: Path) -> str:
+    return f"{_label(file)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n"
 
 
 def _label(file: Path) -> str:
