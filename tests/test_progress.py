@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from mace_rl.config.section import ConfigError
 from mace_rl.runs import progress
 from mace_rl.runs.progress import Run, duration, seconds_left, status
 
@@ -75,7 +76,7 @@ def test_the_table(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_workflow(tmp_path: Path) -> None:
-    with pytest.raises(progress.NoPlanError, match="no workflow has begun here"):
+    with pytest.raises(ConfigError, match="no workflow has begun here"):
         status(tmp_path)
 
 
@@ -84,15 +85,14 @@ DONE_A, DONE_B = ({"env": env, "record": DONE} for env in "AB")
 CASES = [
     ([DONE_A, {}, {}], 2, 100, []),  # 100 s each
     ([DONE_A, {}, {}], 1, 200, []),
-    ([DONE_A, {"work": 3.0}, {}, {}], 2, 300, []),  # the longest first
-    # By itself 60 s more; as others 100 - 50: half of it is over.
-    ([DONE_A, {"told": told(50, 80.0), "held": True}], 2, 55, []),
+    ([DONE_A, {"work": 3.0}, {}, {}], 2, 300, []),  # no shorter than the longest
+    ([DONE_A, {"told": told(50, 80.0), "held": True}], 2, 60, []),  # as it tells itself
     ([DONE_A, {"told": told(5, 40.0), "held": True}], 2, 90, []),  # too early to count
-    ([{"told": told(50, 80.0), "held": True}], 2, 60, []),
     ([{"told": told(50, 80.0), "held": True}, {}], 1, 60 + 110, []),
+    ([DONE_A, {"told": told(5, 340.0), "held": True}], 2, 0, []),  # late
     ([{"told": told(5, 80.0), "held": True}], 2, 0, ["A"]),
     ([DONE_B, {"env": "B"}, {}], 2, 100, ["A"]),
-    ([], 2, 0, []),
+    ([], 0, 0, []),
 ]
 
 
@@ -124,6 +124,6 @@ def test_in_place_on_a_terminal_and_seldom_in_a_file(monkeypatch: pytest.MonkeyP
                 now[0] = float(second)
                 show(told(second + 1, 30.0 + second, left=41.0))
     first, second = file.getvalue().splitlines()
-    assert first == "episode 6/100   return 21.5   β 0.25   steps/s 1830"
-    assert second == "episode 36/100   return 21.5   β 0.25   steps/s 1830   left 50 s"
+    assert first == "episode 31/100   return 21.5   β 0.25   steps/s 1830   left 50 s"
+    assert second == "episode 61/100   return 21.5   β 0.25   steps/s 1830   left 50 s"
     assert all(f"episode {number}/100" in terminal.getvalue() for number in range(1, 62))

@@ -6,7 +6,6 @@ and has no time left, which would have to know that Hopper takes longer than Car
 """
 
 import fcntl
-import heapq
 import json
 import math
 import time
@@ -18,14 +17,10 @@ from statistics import fmean
 from typing import Any, TextIO
 
 from mace_rl import files
-from mace_rl.refusal import Refusal
+from mace_rl.config.section import ConfigError
 
 FILE_SECONDS = 30.0  # between the lines of `line` in a file
 EARLY = 0.1  # the share of its episodes before which a run alone does not say when it ends
-
-
-class NoPlanError(Refusal, ValueError):
-    """A folder in which no workflow has begun."""
 
 
 def cells(told: Mapping[str, Any]) -> dict[str, str]:
@@ -61,27 +56,25 @@ def duration(seconds: float) -> str:
 @contextmanager
 def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Gives the function that shows one run's line, in place or in a file now and then."""
-    due = time.monotonic() + FILE_SECONDS / 6
     in_place = file.isatty()
+    before, after, pause = ("\x1b[2K", "\r", 0.0) if in_place else ("", "\n", FILE_SECONDS)
+    due = time.monotonic() + pause
     if in_place:
         file.write("starting: the first episode waits for its code to be compiled\r")
 
     def show(told: Mapping[str, Any]) -> None:
         nonlocal due
-        text = "   ".join(f"{name} {text}" for name, text in cells(told).items() if text)
-        if in_place:
-            file.write(f"\x1b[2K{text}\r")
-        elif time.monotonic() >= due:
-            due = time.monotonic() + FILE_SECONDS
-            file.write(f"{text}\n")
-        file.flush()
+        if time.monotonic() >= due:
+            due = time.monotonic() + pause
+            text = "   ".join(f"{name} {text}" for name, text in cells(told).items() if text)
+            file.write(f"{before}{text}{after}")
+            file.flush()
 
     try:
         yield show
     finally:
-        if in_place:
-            file.write("\x1b[2K")
-            file.flush()
+        file.write(before)
+        file.flush()
 
 
 def status(results: Path) -> list[str]:
@@ -89,7 +82,7 @@ def status(results: Path) -> list[str]:
     try:
         plan = json.loads((results / files.PLAN).read_bytes())
     except FileNotFoundError:
-        raise NoPlanError(f"{results}: no workflow has begun here: no {files.PLAN}") from None
+        raise ConfigError(f"{results}: no workflow has begun here: no {files.PLAN}") from None
     began = (results / files.PLAN).stat().st_mtime
     runs = [Run(run, results, began) for run in plan["runs"]]
     states = Counter(run.state for run in runs)
@@ -102,19 +95,8 @@ def status(results: Path) -> list[str]:
         heading += f", without {' and '.join(unknown)}" if left and unknown else ""
     rows = [run.row() for run in runs if run.state in ("running", "stopped")]
     table = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
-    return [heading, *aligned(table)]
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows of text as lines with columns, the first two to the left."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            text.ljust(width) if place < 2 else text.rjust(width)
-            for place, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return [heading, *("  ".join(map(str.rjust, row, widths)) for row in table)]
 
 
 class Run:
@@ -138,15 +120,12 @@ class Run:
             self.seconds = told["seconds"] - told["start_seconds"] + left_alone(told)
 
     def left(self, expected: float) -> float:
-        """Seconds to its end, if one like it takes `expected`; its own tell more and more."""
+        """Seconds to its end: by what it tells, or while that is a guess if it takes `expected`."""
         if not self.told:
             return expected
-        share = self.told["episode"] / self.told["episodes"]
+        known = left_alone(self.told)
         spent = self.told["seconds"] - self.told["start_seconds"]
-        known = [(1 - share, expected - spent), (share, left_alone(self.told))]
-        known = [(weight, seconds) for weight, seconds in known if not math.isnan(seconds)]
-        weights = sum(weight for weight, _ in known)
-        return max(0.0, sum(w * s for w, s in known) / weights) if weights else math.nan
+        return expected - spent if math.isnan(known) else known
 
     def row(self) -> dict[str, str]:
         """What there is to show of it."""
@@ -180,26 +159,14 @@ def seconds_left(runs: Sequence[Run], cores: int) -> tuple[float, list[str]]:
     """Seconds to the end of the last run, and the environments left out, of which none is known.
 
     A run is expected to take as long, for its work, as those of its environment that are done or
-    far enough, and as those of its variant if there are any. Those that wait are handed to the one
-    of the `cores` that is free first, the longest first, as Snakemake does.
+    far enough.
     """
-    known = [run for run in runs if not math.isnan(run.seconds)]
-    ends: list[float] = []
-    queue: list[float] = []
-    unknown = set()
+    paces: dict[str, list[float]] = {}
     for run in runs:
-        if run.state in ("done", "stopped"):
-            continue
-        alike = [one for one in known if one.env == run.env and one is not run]
-        alike = [one for one in alike if one.variant == run.variant] or alike
-        expected = run.work * fmean(one.seconds / one.work for one in alike) if alike else math.nan
-        left = run.left(expected)
-        if math.isnan(left):
-            unknown.add(run.env)
-        else:
-            (ends if run.state == "running" else queue).append(left)
-    ends += [0.0] * max(cores - len(ends), not ends)
-    heapq.heapify(ends)
-    for seconds in sorted(queue, reverse=True):
-        heapq.heapreplace(ends, ends[0] + seconds)
-    return max(ends), sorted(unknown)
+        if not math.isnan(run.seconds):
+            paces.setdefault(run.env, []).append(run.seconds / run.work)
+    open_runs = [run for run in runs if run.state in ("running", "waiting")]
+    lefts = [run.left(run.work * fmean(paces.get(run.env, [math.nan]))) for run in open_runs]
+    unknown = {run.env for run, left in zip(open_runs, lefts, strict=True) if math.isnan(left)}
+    known = [max(0.0, left) for left in lefts if not math.isnan(left)]
+    return max([0.0, sum(known) / max(cores, 1), *known]), sorted(unknown)
