@@ -327,7 +327,6 @@ UNFIT = {  # an option's value, and what would be right
     ("evaluate", "--episodes", "-3"): "-3, but should be at least 1",
     ("evaluate", "--seed", "-1"): "-1, but should be at least 0",
     ("verify", "--sample", "0"): "0, but should be at least 1",
-    ("verify", "--sample-seed", "-1"): "-1, but should be at least 0",
 }
 
 

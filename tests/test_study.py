@@ -91,7 +91,7 @@ variant_settings: {mace full: {beta: {kind: none}}}  # variant_settings, 'mace f
 variant_settings: {'{seed}': {beta: {kind: none}}}  # variant_settings, '{seed}', letters
 variant_settings: {mace_ful: {label: x}}  # variant_settings.mace_ful, beta, missing
 variant_settings: {ppo: {label: 3}}  # ppo.label, 3
-variant_settings: {ppo: {label: a}, mace_full: {label: a}}  # full.label is 'a', but so is that of
+variant_settings: {ppo: {label: a}, mace_full: {label: a}}  # 2, label 'a', own
 variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluish', tab:blue
 variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
 variant_settings: {mace_fixed: {meta: {}}}  # mace_fixed, 'meta', 'exponential' does not use

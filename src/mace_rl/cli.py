@@ -116,8 +116,7 @@ def parser() -> argparse.ArgumentParser:
         "reference --sample 1",
     )
     add("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
-    add("--sample", type=int, help="how many, chosen at random (default: all)")
-    add("--sample-seed", type=int, default=0, help="which ones (default: 0)")
+    add("--sample", type=int, help="how many, always the same ones (default: all)")
     return top
 
 
@@ -254,13 +253,12 @@ def tensorboard(arguments: argparse.Namespace) -> None:
 
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
-    sample, seed = arguments.sample, arguments.sample_seed
+    sample = arguments.sample
     _require(sample is None or sample >= 1, "--sample", sample, "be at least 1")
-    _require(seed >= 0, "--sample-seed", seed, "be at least 0")
     from mace_rl.runs import verify
 
     confidence = read_study([CONFIG]).metrics.confidence
-    for line in verify.verify(arguments.folder, sample, seed, confidence):
+    for line in verify.verify(arguments.folder, sample, confidence):
         print(line, flush=True)
 
 

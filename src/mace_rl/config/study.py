@@ -52,15 +52,6 @@ def _once(values: list[Any]) -> list[Any]:
     return values
 
 
-def _name(name: str) -> str:
-    if not re.fullmatch(SAFE_NAME, name):
-        raise ValueError(
-            "a name here becomes a folder: it should consist of letters, digits, '.', '_' and '-', "
-            "and begin with a letter or digit"
-        )
-    return name
-
-
 class Variant(Section):
     """One variant: what sets its β, what else differs, and how it is shown.
 
@@ -94,7 +85,7 @@ class Study(Section):
     environment_seeds: dict[str, Seeds] = Field(default={})
     training: Settings  # hyperparameters of every run ...
     environment_settings: dict[str, Settings]  # ... changed for an environment ...
-    variant_settings: dict[Annotated[str, AfterValidator(_name)], Variant]  # ... and for a variant
+    variant_settings: dict[str, Variant]  # ... and for a variant
     metrics: MetricsConfig
     figure: FigureConfig
 
@@ -158,14 +149,13 @@ def load_study(config: Any, origin: str) -> Study:
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
-        named: dict[str, str] = {}  # variants by label
-        for variant, label in study.labels.items():
-            if label in named:
-                raise ConfigError(
-                    f"variant_settings.{variant}.label is {label!r}, but so is that of "
-                    f"{named[label]}; each should have its own"
-                )
-            named[label] = variant
+        for variant in study.variant_settings:
+            _check_name(variant, "variant_settings")
+        [(label, count)] = Counter(study.labels.values()).most_common(1)
+        if count > 1:
+            raise ConfigError(
+                f"{count} variants have the label {label!r}; each should have its own"
+            )
         for pair in study.metrics.comparisons:
             for variant in pair:
                 _check_known(

@@ -5,10 +5,11 @@ it nor changes by it. The package tensorboardX writes the files; only TensorBoar
 """
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import pandas as pd
 
 from mace_rl import files
 from mace_rl.files import write_atomically
@@ -19,19 +20,13 @@ from mace_rl.runs.provenance import file_digest, read_record
 
 # Of a run's tables: the prefix of their tags, and what they are called in a checkpoint.
 TABLES = {files.EPISODES: ("episodes", "records"), files.DIAGNOSTICS: ("updates", "diagnostics")}
-Table = Mapping[str, np.ndarray]  # columns, [rows]
-Row = tuple[int, dict[str, float]]  # the episode, and each tag's value
-
-
-class EventsError(Refusal, RuntimeError):
-    """Events that cannot be written; the message says why."""
 
 
 def write_all(folder: Path, out: Path) -> int:
     """Write the events of every run in and below `folder` to the same places below `out`.
 
     Returns how many runs there are. Raises `RecordError` if there are none, or for damaged records,
-    and `EventsError` without tensorboardX.
+    and `Refusal` without tensorboardX.
     """
     names = (files.RECORD, files.CHECKPOINT)
     runs = sorted({path.parent for name in names for path in folder.rglob(name)})
@@ -52,7 +47,7 @@ def write(run: Path, out: Path) -> None:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
     except ImportError:
-        raise EventsError(
+        raise Refusal(
             "events are written by the package tensorboardX: pip install tensorboardX"
         ) from None
     with tempfile.TemporaryDirectory() as scratch:
@@ -68,41 +63,34 @@ def write(run: Path, out: Path) -> None:
         write_atomically(out / files.EVENTS, path.read_bytes())
 
 
-def read(run: Path) -> dict[str, Table]:
+def read(run: Path) -> dict[str, pd.DataFrame]:
     """The tables of a run by the prefix of their tags: its files, or what its checkpoint has.
 
     A kept run may be without `diagnostics.csv`. Raises `RecordError` if a file is not the one that
     `run.json` describes, `CheckpointError` and `ProvenanceError` for other damage.
     """
-    import pandas as pd
-
     if not (run / files.RECORD).exists():
         state = checkpoint.read(run / files.CHECKPOINT)["state"]["trainer"]
         return {
-            prefix: {name: column.numpy() for name, column in state[key].items()}
+            prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
             for prefix, key in TABLES.values()
         }
     digests = read_record(run / files.RECORD)["outputs"]
-    tables: dict[str, Table] = {}
+    tables = {}
     for name, (prefix, _) in TABLES.items():
         path = run / name
-        if name == files.EPISODES and not path.exists():
-            raise RecordError(f"{path}: the file is missing")
-        if path.exists() and file_digest(path) != digests.get(name):
+        if path.exists() and file_digest(path) == digests.get(name):
+            tables[prefix] = pd.read_csv(path)
+        elif path.exists() or name == files.EPISODES:
             raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
-        if path.exists():
-            frame = pd.read_csv(path)
-            tables[prefix] = {str(column): frame[column].to_numpy() for column in frame}
     return tables
 
 
-def rows(tables: Mapping[str, Table]) -> Iterator[Row]:
-    """The rows of the tables in the order of their episodes, without what is NaN."""
-    found: list[Row] = []
+def rows(tables: Mapping[str, pd.DataFrame]) -> list[tuple[int, dict[str, float]]]:
+    """Each row's episode and its values by tag but for NaN, in the order of the episodes."""
+    found: list[Any] = []
     for prefix, table in tables.items():
-        names = [name for name in table if name not in ("episode", "update")]
-        values = zip(*(table[name].tolist() for name in names), strict=True)
-        for episode, row in zip(table["episode"].tolist(), values, strict=True):
-            cells = {f"{prefix}/{name}": x for name, x in zip(names, row, strict=True) if x == x}
-            found.append((episode, cells))
-    yield from sorted(found, key=lambda row: row[0])  # stable: episodes before their update
+        values = table.set_index("episode").drop(columns="update", errors="ignore")
+        for episode, row in values.add_prefix(f"{prefix}/").iterrows():
+            found.append((episode, row.dropna().to_dict()))
+    return sorted(found, key=lambda row: row[0])  # stable: episodes before their update
