@@ -1,15 +1,13 @@
-"""The benchmark: what measuring must not change, PureJaxRL for real, and its page."""
+"""The benchmark: what measuring must not change, and PureJaxRL for real."""
 
 import importlib
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from benchmarks import breakdown, page, purejaxrl
-from benchmarks.measuring import FILE, FULL, QUICK
+from benchmarks import breakdown, purejaxrl
 from mace_rl.results.paper import CARTPOLE, HOPPER
 
 
@@ -30,27 +28,6 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()
-
-
-def test_the_page_is_that_of_the_measurements(tmp_path):
-    shutil.copy(FULL.folder / FILE, tmp_path)
-    assert page.write(tmp_path).read_bytes() == (FULL.folder / "README.md").read_bytes()
-
-
-@pytest.mark.parametrize("contestant", purejaxrl.ROLLOUTS)
-def test_purejaxrl_trains_whole_rollouts_with_our_settings(run_config, contestant):
-    for scale in (FULL, QUICK):
-        for environment in purejaxrl.ENVIRONMENTS:
-            steps = scale.steps[environment]
-            given = purejaxrl.configuration(contestant, environment, steps)
-            rollout = given["NUM_ENVS"] * given["NUM_STEPS"]
-            assert steps % rollout == rollout % given["NUM_MINIBATCHES"] == 0
-    ours = run_config(environment, "ppo").ppo
-    assert (given["LR"], given["GAMMA"]) == (ours.actor_learning_rate, ours.discount)
-    assert (given["UPDATE_EPOCHS"], given["CLIP_EPS"]) == (ours.epochs, ours.clip)
-    assert (given["GAE_LAMBDA"], given["ENT_COEF"]) == (ours.gae_lambda, ours.entropy_coefficient)
-    assert given["MAX_GRAD_NORM"] == ours.max_gradient_norm
-    assert ours.hidden_units == [64, 64], "as PureJaxRL has them"
 
 
 def test_purejaxrl_s_training_imports_nothing_but_what_its_environment_has():

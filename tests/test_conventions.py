@@ -1,21 +1,12 @@
-"""Links and commands that the pages name lead somewhere, and the citation is of this version."""
+"""Links and commands that the pages name lead somewhere."""
 
 import re
-import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-
-
-def test_the_citation_is_of_this_version() -> None:
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert citation["version"] == project["version"]
-    assert (ROOT / "LICENSE").read_text().startswith(f"{citation['license']} License\n")
 
 
 def anchors(page: Path) -> set[str]:

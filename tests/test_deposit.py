@@ -1,7 +1,6 @@
 """The archive for a DOI: what is committed, as other programs see it, equal each time."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -57,15 +56,3 @@ def test_what_is_not_committed_is_refused(clone, change):
     (clone / change).write_text("changed")
     with pytest.raises(DepositError, match=rf"^not committed: .*{change}\W*$"):
         deposit(clone)
-
-
-def test_the_command_writes_it_or_says_why_not_in_one_line(clone, tmp_path):
-    command = [sys.executable, "-m", "tools.deposit", str(tmp_path / "out")]
-    said = subprocess.run(command, cwd=clone, capture_output=True, text=True)
-    assert said.returncode == 0, said.stderr
-    digest, path = said.stdout.split()
-    assert run("sha256sum", path, cwd=clone).startswith(digest)
-    assert Path(path).read_bytes() == deposit(clone)[1]
-    (clone / "README.md").unlink()
-    said = subprocess.run(command, cwd=clone, capture_output=True, text=True)
-    assert (said.returncode, said.stderr) == (1, "deposit: not committed: README.md\n")

@@ -8,10 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
-
-from mace_rl.wrappers import CuriosityReward
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
@@ -51,12 +47,8 @@ def test_help_and_mistakes(monkeypatch, capsys):
         line = refused("--environment", name)
         assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")
         assert "\n" not in line
-
-
-def test_too_few_steps_for_an_episode_are_said():
-    done = run("--environment", "Acrobot-v1", "--steps", "1", "--seeds", "1")
-    assert done.returncode == 1 and "nan" not in done.stdout
-    assert done.stderr == "sb3_ppo: no episode ended in --steps 1: give more\n"
+    few = refused("--environment", "Acrobot-v1", "--steps", "1", "--seeds", "1")
+    assert few == "sb3_ppo: no episode ended in --steps 1: give more"
 
 
 def test_curiosity_changes_the_policy_and_not_what_is_counted():
@@ -86,15 +78,3 @@ def test_what_the_page_shows_works(tmp_path, monkeypatch):
     names["shared"].reset()
     assert names["shared"].step(np.arange(4))[1].shape == (4,)
     names["agent"].learn(1)
-
-
-def test_several_environments_of_stable_baselines3_s():
-    """Each has a curiosity of its own, and Monitor inside reports what is extrinsic."""
-    envs = make_vec_env(
-        "CartPole-v1", 2, seed=0, wrapper_class=CuriosityReward, wrapper_kwargs={"beta": 0.3}
-    )
-    agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=128, n_epochs=1, device="cpu")
-    agent.learn(512)
-    assert all(episode["r"] == episode["l"] for episode in agent.ep_info_buffer)
-    first, second = (env.appraisal.curiosity.memory for env in envs.envs)
-    assert len(first) > 0 < len(second) and first is not second

@@ -1,8 +1,8 @@
-"""Trainings and workflows that are killed at bad moments end as if they had not: make kill-test.
+"""Trainings that are killed at bad moments end as if they had not: make kill-test.
 
 Each environment and variant of the paper is trained undisturbed; then a training is killed
 (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its results, and the
-same command is given again. A small workflow gets SIGINT, SIGTERM and SIGKILL.
+same command is given again. tests/test_workflow.py does it to a workflow.
 """
 
 import os
@@ -12,22 +12,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
-import psutil
 import pytest
-from shared import ENVIRONMENTS, OUTCOME, RESULTS, VARIANTS, contents, provenance_of
+from shared import ENVIRONMENTS, OUTCOME, RESULTS, VARIANTS, provenance_of
 from shared import files as files_in
 
 from mace_rl import files
 
 pytestmark = [pytest.mark.slow, pytest.mark.kill]
 
-ROOT = Path(__file__).parents[1]
 EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
 # Checkpoints as fast as they can be written: the moments to hit are then all through the training.
 OFTEN = os.environ | {"MACE_RL_CHECKPOINT_SECONDS": "0.05"}
@@ -35,7 +32,6 @@ TRAIN = (
     "import mace_rl.runs.run as r; r.CHECKPOINT_COST = 1.0; from mace_rl.cli import main; main()"
 )
 ATTEMPTS = 3  # to hit a moment
-PATIENCE = 30.0  # seconds for the jobs of a killed Snakemake to end
 
 
 def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[bytes]:
@@ -129,57 +125,3 @@ def test_a_killed_training_ends_with_the_same_bits(
     for name in OUTCOME:
         assert (folder / name).read_bytes() == (undisturbed.folder / name).read_bytes(), name
     assert provenance_of(folder)["interruptions"] or not cut, "it started afresh"
-
-
-def snakemake(results: Path) -> subprocess.Popen[bytes]:
-    """Begin a small workflow, in a session of its own."""
-    command = [sys.executable, "-m", "snakemake", "-j2", "all", "--config", f"results={results}"]
-    command += ["environments=[CartPole-v1, Acrobot-v1]", "seeds=[0]", "training={episodes: 150}"]
-    with results.with_suffix(".log").open("ab") as log:
-        return subprocess.Popen(
-            command, cwd=ROOT, env=OFTEN, stdout=log, stderr=log, start_new_session=True
-        )
-
-
-def alive(session: int) -> list[int]:
-    """The processes of a session."""
-    found = []
-    for pid in psutil.pids():
-        with suppress(ProcessLookupError):  # it has just ended
-            if os.getsid(pid) == session:
-                found.append(pid)
-    return found
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> dict[str, bytes]:
-    """What an undisturbed workflow gives."""
-    results = tmp_path_factory.mktemp("workflow") / "whole"
-    assert snakemake(results).wait() == 0, results.with_suffix(".log").read_text()
-    return contents(results)
-
-
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_workflow_ends_with_the_same_bits(
-    whole: dict[str, bytes], sent: signal.Signals, tmp_path: Path
-) -> None:
-    results = tmp_path / "results"
-    process = snakemake(results)
-    while process.poll() is None and not list(results.glob(f"runs/*/*/*/{files.CHECKPOINT}")):
-        time.sleep(0.05)
-    assert process.poll() is None, "it ended before it was hit"
-    if sent == signal.SIGINT:  # Ctrl-C goes to the whole foreground group
-        os.killpg(process.pid, sent)
-    else:
-        process.send_signal(sent)
-    process.wait()
-    deadline = time.monotonic() + PATIENCE
-    while left := alive(process.pid):  # jobs notice that Snakemake is gone, and end
-        assert time.monotonic() < deadline, f"left: {left}"
-        time.sleep(0.1)
-    checkpoints = results.glob(f"runs/*/*/*/{files.CHECKPOINT}")
-    cut = [path.parent for path in checkpoints if cut_off(path.parent)]
-    assert cut or sent == signal.SIGTERM  # at which Snakemake lets jobs come to their end
-    assert snakemake(results).wait() == 0, results.with_suffix(".log").read_text()
-    assert contents(results) == whole
-    assert all(provenance_of(run)["interruptions"] for run in cut), "one started afresh"

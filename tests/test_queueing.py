@@ -23,12 +23,6 @@ def test_snakemake_knows_every_key_of_the_profile() -> None:
     assert sizes == {f"runs_{size}": size for size in sizes.values()}
 
 
-def test_a_key_that_snakemake_does_not_know_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text(PROFILE.read_text() + "slurm-requeues: true\n")
-    with pytest.raises(SystemExit):
-        parse_args(["--workflow-profile", str(tmp_path / "config.yaml"), "all"])
-
-
 def test_the_profile_has_all_of_the_default_one() -> None:
     default = yaml.safe_load((ROOT / "profiles" / "default" / "config.yaml").read_text())
     slurm = yaml.safe_load(PROFILE.read_text())
@@ -36,15 +30,6 @@ def test_the_profile_has_all_of_the_default_one() -> None:
     wanted = {key: value for key, value in default.items() if not key.startswith(("__", "?"))}
     assert "rerun-triggers" in wanted
     assert {key: slurm.get(key) for key in wanted} == wanted
-
-
-def test_only_trainings_go_into_the_queue() -> None:
-    files = [ROOT / "Snakefile", *(ROOT / "workflow" / "rules").iterdir()]
-    text = "".join(file.read_text() for file in files)
-    local = re.findall(r"^ *localrules:\n((?: +[\w, ]+\n)+)", text, re.MULTILINE)
-    rules = set(re.findall(r"^ *(?:use )?rule (?:\w+ as )?(\w+)\b", text, re.MULTILINE))
-    assert "forest" in rules, "which is there for some studies only"
-    assert rules - set(re.findall(r"\w+", " ".join(local))) == {"train"}
 
 
 def test_minutes_grow_with_the_work(run_config) -> None:

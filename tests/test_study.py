@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from mace_rl.config.reading import merge, read_yaml, typed
+from mace_rl.config.reading import read_yaml, typed
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import load_study, read_study
@@ -40,13 +40,9 @@ training: {ppo: {clpi: 0.2}}  # training, 'ppo.clpi', 0.2, 'clip'
 environment_settings: {Acrobot-v1: {episode: 1}}  # settings.Acrobot-v1, 'episode', 'episodes'
 variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capcity', 7, 'capacity'
 metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'mace_full'
-metrics: {comparisons: [[ppo]]}  # metrics.comparisons.0, ['ppo'], 2 items
-variant_settings: {mace_fixed_0.2: {metaa: {}}}  # variant_settings.mace_fixed_0.2, 'metaa', 'meta'
 variant_settings: {mace_full: {beta: {flor: 0}}}  # variant_settings.mace_full, 'beta.flor'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
 variant_settings: {mace_fixed: {beta: {initial: DELETE}}}  # mace_fixed, 'beta.initial', missing
-metrics: {treshold: 0.5}  # 'metrics.treshold', 'threshold'
-figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
 training: {ppo: {clip: high}}  # training, ppo.clip, 'high', number
@@ -55,8 +51,6 @@ environment_settings: {Acrobot-v1: {episodes: '60'}}  # Acrobot-v1, episodes, '6
 training: {episodes: 10.5}  # episodes, 10.5, integer
 training: {episodes: true}  # episodes, True, integer
 training: {episodes: -5}  # training, episodes, -5, greater than 0
-environment_settings: {Acrobot-v1: {episodes: 0}}  # environment_settings.Acrobot-v1, episodes, 0
-training: {ppo: {discount: 1.5}}  # ppo.discount, 1.5, 1
 training: {ppo: {clip: .nan}}  # ppo.clip, nan, finite
 training: {memory: {capacity: 5}}  # memory, neighbours, capacity
 training: {engine: jax}  # engine, 'jax', 'torch'
@@ -72,22 +66,18 @@ training: {ppo: {network: {kind: torch, module: no_such:thing}}}  # network.modu
 variant_settings: {x: {beta: {kind: custom, rule: no_such:Rule}}}  # x, beta.rule, 'no_such:Rule'
 metrics: {custom: [no_such:metric]}  # metrics.custom, 'no_such:metric'
 environments: [no_such:Walk-v0]  # environment, 'no_such:Walk-v0', no_such
-environments: [CartPole-v9]  # environments, 'CartPole-v9', 'CartPole-v1'
-environments: [Acrobot]  # 'Acrobot', 'Acrobot-v1'
+environments: [CartPole-v9]  # environment, 'CartPole-v9', 'CartPole-v1'
 environment_settings: {HoperBulletEnv-v0: {}}  # 'HoperBulletEnv-v0', 'HopperBulletEnv-v0'
-environments: [CliffWalking-v1]  # environments, settings.CliffWalking-v1.max_episode_steps should
+environments: [CliffWalking-v1]  # environment, settings.CliffWalking-v1.max_episode_steps should
 environment_settings: {Blackjack-v1: {}}  # time limit, settings.Blackjack-v1.max_episode_steps
 environment_settings: {CliffWalking-v1: {max_episode_steps: 0}}  # CliffWalking-v1, steps, 0
-environments: [LunarLander-v3]  # environments, 'LunarLander-v3', installed
-environments: [phys2d/CartPole-v1]  # environments, 'phys2d/CartPole-v1', letters
+environments: [LunarLander-v3]  # environment, 'LunarLander-v3', installed
+environments: [phys2d/CartPole-v1]  # environment, 'phys2d/CartPole-v1', letters
 environments: [../x]  # '../x', letters
 environments: [MountainCar-v0]  # metrics.random_return.MountainCar-v0, missing
 environments: [CartPole-v1, CartPole-v1]  # environments, 'CartPole-v1' should be there once
 environments: []  # environments, [], at least 1
 variants: [ppo, mace_ful]  # variants, 'mace_ful', 'mace_full'
-variants: [ppo, ppo]  # variants, 'ppo' should be there once
-variants: []  # variants, [], at least 1
-variant_settings: {mace full: {beta: {kind: none}}}  # variant_settings, 'mace full', letters
 variant_settings: {'{seed}': {beta: {kind: none}}}  # variant_settings, '{seed}', letters
 variant_settings: {mace_ful: {label: x}}  # variant_settings.mace_ful, beta, missing
 variant_settings: {ppo: {label: 3}}  # ppo.label, 3
@@ -96,17 +86,13 @@ variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluis
 variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
 variant_settings: {mace_fixed: {meta: {}}}  # mace_fixed, 'meta', 'exponential' does not use
 variant_settings: {ppo: {seed: 3}}  # variant_settings.ppo.seed, 3, seeds
-variant_settings: [ppo]  # variant_settings, dictionary
 seeds: [0, 1, 0]  # seeds, [0, 1, 0], 0 should be there once
 seeds: 3  # seeds, 3, list
 seeds: [-1]  # seeds.0, -1, 0
-seeds: [0.5]  # seeds.0, 0.5, integer
 seeds: [4294967296]  # seeds.0, 4294967296
-seeds: []  # seeds, [], at least 1
 environment_seeds: {HopperBulletEnvv0: [3]}  # environment_seeds, 'HopperBulletEnvv0', nearest
 metrics: {random_return: {CartPole-1: 4.0}}  # metrics.random_return, 'CartPole-1', 'CartPole-v1'
 metrics: {reference_return: {CartPole-1: 4.0}}  # reference_return, 'CartPole-1', 'CartPole-v1'
-metrics: {solved_return: {CartPole-1: 4.0}}  # solved_return, 'CartPole-1', 'CartPole-v1'
 results: 5  # results, 5, string
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
@@ -127,7 +113,7 @@ def test_mistake_is_named_in_one_line(line: str) -> None:
 
 
 LAYERS = """
-training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}}
+training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}, beta: {kind: constant, value: 0.4}}
 environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {hidden_units: 2}}}
 variant_settings: {mace_full: {episodes: 3, ppo: {discount: 0.3}}}
 """
@@ -137,6 +123,7 @@ def test_settings_go_over_one_another_in_order() -> None:
     study = load_study(changed(yaml.safe_load(LAYERS)), "test")
     plain = study.run_config("Acrobot-v1", "ppo", 0)
     assert (plain.episodes, plain.ppo.clip, plain.ppo.epochs) == (1, 0.1, 1)
+    assert plain.beta.model_dump() == {"kind": "none"}  # replaced as a whole
     assert plain.ppo.discount == PLAIN["training"]["ppo"]["discount"]
     environment = study.run_config("CartPole-v1", "mace_fixed", 7)
     assert (environment.episodes, environment.ppo.clip, environment.ppo.epochs) == (2, 0.2, 1)
@@ -145,12 +132,6 @@ def test_settings_go_over_one_another_in_order() -> None:
     assert (both.episodes, both.ppo.clip, both.ppo.discount) == (3, 0.2, 0.3)
     assert (both.environment, both.variant) == ("CartPole-v1", "mace_full")
     assert both.meta.hidden_units == 2
-
-
-def test_beta_is_replaced_as_a_whole() -> None:
-    exponential = {"kind": "exponential", "initial": 0.4, "decay": 0.9, "floor": 0.1}
-    study = load_study(changed({"training": {"beta": exponential}}), "test")
-    assert study.run_config("CartPole-v1", "ppo", 0).beta.model_dump() == {"kind": "none"}
 
 
 SECTIONS = {"memory", "novelty", "meta"}
@@ -174,23 +155,6 @@ def test_a_run_holds_the_sections_that_its_variant_uses(variant: str, used: set[
     assert check(RunConfig, settings, "run.json") == plain
 
 
-@pytest.mark.parametrize("variant", ["ppo", "mace_fixed", "mace_full"])
-def test_settings_of_an_old_run_json_still_read(variant: str) -> None:
-    """It has every section, whatever the variant, and no key that came later."""
-    study = load_study(PLAIN, "test")
-    config, full = (study.run_config("CartPole-v1", name, 3) for name in (variant, "mace_full"))
-    old = full.settings() | {key: config.settings()[key] for key in ("variant", "beta")}
-    old = changed(
-        {
-            **dict.fromkeys(("engine", "environment_arguments"), "DELETE"),
-            "ppo": {"network": "DELETE"},
-            "novelty": dict.fromkeys(("kind", "estimator", "arguments"), "DELETE"),
-        },
-        old,
-    )
-    assert check(RunConfig, old, "run.json") == config
-
-
 def test_labels_and_colours_stand_with_the_variants() -> None:
     look = {"label": "PPO itself", "colour": "k"}
     more = {"ppo": look, "mine": {"beta": {"kind": "none"}}}
@@ -199,19 +163,6 @@ def test_labels_and_colours_stand_with_the_variants() -> None:
     assert study.labels == {"mine": "mine", "ppo": "PPO itself"}
     assert study.colours["ppo"] == "k" and study.colours["mine"].startswith("C")
     assert not {"label", "colour"} & set(study.run_config("CartPole-v1", "ppo", 0).settings())
-
-
-def test_run_config_of_a_run_outside_the_lists() -> None:
-    study = load_study(changed({"environments": ["CartPole-v1"], "seeds": [0]}), "test")
-    assert study.run_config("Acrobot-v1", "mace_fixed_0.2", 99).beta.initial == 0.2
-    for arguments, fragment in (
-        (("Acrobat-v1", "ppo", 0), "Acrobot-v1"),
-        (("Acrobot-v1", "pop", 0), "'ppo'"),
-        (("Acrobot-v1", "ppo", -1), "seed is -1"),
-        (("Acrobot-v1", "ppo", 2**32), "seed is 4294967296"),
-    ):
-        with pytest.raises(ConfigError, match=fragment):
-            study.run_config(*arguments)
 
 
 def test_files_are_read_over_one_another(tmp_path: Path) -> None:
@@ -242,18 +193,6 @@ def test_every_study_of_the_project_can_be_carried_out(names: list[str]) -> None
     for run in study.runs():
         study.run_config(*run)
     study.metrics.within(study.environments, study.variants)
-
-
-def test_merge_as_snakemake_does() -> None:
-    from snakemake.utils import update_config
-
-    base = {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2], "f": 3, "g": {"h": 1}}
-    over = {"a": {"c": {"d": 4, "x": 5}}, "e": [9], "f": {"y": 6}, "g": None}
-    expected = copy.deepcopy(base)
-    update_config(expected, over)
-    unchanged = copy.deepcopy(base)
-    assert merge(base, over) == expected
-    assert base == unchanged
 
 
 @pytest.mark.parametrize(

@@ -29,16 +29,15 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True)
 
-    def command(name: str, summary: str, does: str, example: str) -> Callable[..., Any]:
+    def command(name: str, does: str, example: str) -> Callable[..., Any]:
         epilog = f"example: mace-rl {name} {example}"
         return commands.add_parser(
-            name, help=summary, description=does, epilog=epilog, allow_abbrev=False
+            name, help=does, description=does, epilog=epilog, allow_abbrev=False
         ).add_argument
 
     add = command(
         "train",
-        "carry out one training run",
-        "Carry out one training run; the same command resumes it if interrupted.",
+        "carry out one training run; the same command resumes it if interrupted",
         "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
     )
     add("--env", required=True, help="a registered Gymnasium id")
@@ -62,28 +61,25 @@ def parser() -> argparse.ArgumentParser:
     add("--out", required=True, type=Path, help="folder for the results")
     add = command(
         "status",
-        "how far the workflow's runs are",
-        "Print how far the runs are that the workflow began, and about when they will be done.",
+        "print how far the workflow's runs are, and about when they will be done",
         "results/reduced",
     )
     add("folder", type=Path, help="the workflow's results folder")
-    for name, summary, does, example, episodes in (
+    for name, does, example, episodes in (
         (
             "evaluate",
-            "play episodes with a trained agent",
-            "Play episodes with a trained agent and print its returns.",
+            "play episodes with a trained agent and print its returns",
             "cartpole_run --episodes 20 --deterministic",
             100,
         ),
         (
             "watch",
-            "film a trained agent, as a GIF",
-            "Write an animated GIF of the first episodes that `mace-rl evaluate` plays.",
+            "write an animated GIF of the first episodes that evaluate plays",
             "cartpole_run --out cartpole.gif",
             1,
         ),
     ):
-        add = command(name, summary, does, example)
+        add = command(name, does, example)
         add("folder", type=Path, help="of a finished run")
         add("--episodes", type=int, default=episodes, help=f"how many (default: {episodes})")
         add("--seed", type=int, default=0, help="of the episodes (default: 0)")
@@ -102,9 +98,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add = command(
         "tensorboard",
-        "write what runs recorded as TensorBoard's events",
-        "Write what runs recorded, finished or not, as event files for TensorBoard; again later, "
-        "to bring them up to date.",
+        "write what runs recorded, finished or not, as event files for TensorBoard",
         "cartpole_run --out events",
     )
     add("folder", type=Path, help="of a run, or with runs below it")
@@ -112,7 +106,6 @@ def parser() -> argparse.ArgumentParser:
     add = command(
         "verify",
         "repeat kept runs and compare to the bit",
-        "Repeat runs that were kept and say whether they come out the same.",
         "reference --sample 1",
     )
     add("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")

@@ -11,27 +11,19 @@ from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
-# A training depends on all of this package but these, and an evaluation on all but the rooms of the
-# second line: a file that is new counts in both until it stands here.
-NO_PART = {
-    "training": (
-        *("results", "report", "wrappers.py", "appraisal.py", "cli.py", "__main__.py"),
-        *("config/reading.py", "config/results.py", "config/study.py", "config/wrappers.py"),
-        *("runs/evaluate.py", "runs/events.py", "runs/finished.py", "runs/progress.py"),
-        *("runs/queueing.py", "runs/verify.py", "runs/watch.py"),
-    ),
-    "evaluation": (
-        *("agent", "beta", "bonus", "environments", "report", "train.py", "wrappers.py", "cli.py"),
-        *("appraisal.py", "__main__.py", "runs/progress.py", "runs/queueing.py"),
-    ),
-    "everything": (),
-}
+# A training depends on all of this package but these: a new file counts until it stands here.
+NO_PART = (
+    *("results", "report", "wrappers.py", "appraisal.py", "cli.py", "__main__.py"),
+    *("config/reading.py", "config/results.py", "config/study.py", "config/wrappers.py"),
+    *("runs/evaluate.py", "runs/events.py", "runs/finished.py", "runs/progress.py"),
+    *("runs/queueing.py", "runs/verify.py", "runs/watch.py"),
+)
 # The form of a run's records, which is the training's as well.
 SHARED = ("results/__init__.py", "results/records.py")
 
 
 def digest(part: str, *own: Path) -> str:
-    """SHA-256 over names and contents of what "training", "evaluation" or "everything" depends on.
+    """SHA-256 over names and contents of what "training" depends on, or of "everything".
 
     own: files beside this package that count too, such as a script or code of the user's own, but
     not what they import in their turn.
@@ -41,13 +33,13 @@ def digest(part: str, *own: Path) -> str:
 
 
 def files(part: str) -> list[Path]:
-    """The source files of this package that a part of the work depends on."""
-    left_out = [PACKAGE / name for name in NO_PART[part]]
+    """The source files of this package: "everything", or what a "training" depends on."""
+    left_out = [PACKAGE / name for name in NO_PART] if part == "training" else []
+    shared = [PACKAGE / name for name in SHARED]
     return sorted(
         file
         for file in PACKAGE.rglob("*.py")
-        if file in [PACKAGE / name for name in SHARED]
-        or not any(file == place or place in file.parents for place in left_out)
+        if file in shared or not {file, *file.parents}.intersection(left_out)
     )
 
 

@@ -117,7 +117,7 @@ def code(script, settings=None):
     an input's time stamp first, and records what it contained when the job ended, so code that was
     edited meanwhile would pass for the code that ran.
     """
-    part = {"train.py": "training", "report.py": "everything"}.get(script, "evaluation")
+    part = "training" if script == "train.py" else "everything"
     scripts = [Path(workflow.basedir, "workflow", "scripts", name) for name in (script, "job.py")]
     named = settings.references() if settings else {}
     return digest(part, *scripts, *(source_file(name, key) for key, name in named.items()))

@@ -6,6 +6,7 @@ module is imported whenever the workflow is planned, so it stays clear of torch 
 
 import difflib
 import importlib.util
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -90,14 +91,9 @@ class Study(Section):
     figure: FigureConfig
 
     @cached_property
-    def _combinations(self) -> dict[tuple[str, str], RunConfig]:
-        """The checked settings of every environment and variant, selected or not, for seed 0."""
-        environments = dict.fromkeys([*self.environments, *self.environment_settings])
-        return {
-            (environment, variant): _resolve(self, environment, variant)
-            for environment in environments
-            for variant in self.variant_settings
-        }
+    def _resolved(self) -> dict[tuple[str, str], RunConfig]:
+        """What `run_config` has found so far, for seed 0."""
+        return {}
 
     def runs(self) -> list[tuple[str, str, int]]:
         """Environment, variant and seed of every run, in the configured order."""
@@ -122,19 +118,14 @@ class Study(Section):
     def run_config(self, environment: str, variant: str, seed: int) -> RunConfig:
         """The settings of one run: `training`, then the environment's, then the variant's.
 
-        The environment and the variant need settings, not a place in the study's lists. Raises
-        `ConfigError` for a seed out of range and, if they are new to the study, for what
-        `load_study` would refuse in an environment or a variant.
+        They need no place in the study's lists. Raises `ConfigError` for what cannot be.
         """
-        if (environment, variant) not in self._combinations:
+        if (environment, variant) not in self._resolved:
             _check_known(variant, self.variant_settings, "variant", "variant_settings")
-            template = _resolve(self, environment, variant)
-            _check_environment(template, "environment")
-        else:
-            template = self._combinations[environment, variant]
+            self._resolved[environment, variant] = _resolve(self, environment, variant)
         if not 0 <= seed < 2**32:
             raise ConfigError(f"seed is {seed}, but should be from 0 to 4294967295")
-        return template.model_copy(update={"seed": seed})
+        return self._resolved[environment, variant].model_copy(update={"seed": seed})
 
 
 def load_study(config: Any, origin: str) -> Study:
@@ -161,12 +152,9 @@ def load_study(config: Any, origin: str) -> Study:
                 _check_known(
                     variant, study.variant_settings, "metrics.comparisons", "variant_settings"
                 )
-        known = dict.fromkeys(study.environments, "environments")
-        known |= dict.fromkeys(study.environment_settings, "environment_settings")
-        for environment, key in known.items():
-            _check_name(environment, key)
-            for variant in study.variant_settings:  # every run's settings are checked here
-                _check_environment(study._combinations[environment, variant], key)
+        known = dict.fromkeys([*study.environments, *study.environment_settings])
+        for environment, variant in itertools.product(known, study.variant_settings):
+            study.run_config(environment, variant, 0)  # checks its settings
         for environment in study.environment_seeds:
             _check_known(environment, known, "environment_seeds", "environments")
         for environment in study.environments:
@@ -213,6 +201,7 @@ def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
                 )
         settings = merge_layers(settings, layer)
     settings |= {"environment": environment, "variant": variant, "seed": 0}
+    _check_name(environment, "environment")
     try:
         config = RunConfig.model_validate(settings)
     except ValidationError as error:
@@ -227,6 +216,7 @@ def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
                 f"variant_settings.{variant} has the section {section!r}, which a variant with "
                 f"{reason} does not use"
             )
+    _check_environment(config)
     return config
 
 
@@ -248,10 +238,9 @@ def _check_name(environment: str, key: str) -> None:
         )
 
 
-def _check_environment(config: RunConfig, key: str) -> None:
+def _check_environment(config: RunConfig) -> None:
     """Refuse an environment that cannot be made with these settings, without making it."""
-    name = config.environment
-    _check_name(name, key)
+    name, key = config.environment, "environment"
     if ":" in name:
         import_module(name, key)  # which registers it
     registered = name.rpartition(":")[2]
