@@ -250,8 +250,7 @@ def verify(arguments: argparse.Namespace) -> None:
     _require(sample is None or sample >= 1, "--sample", sample, "be at least 1")
     from mace_rl.runs import verify
 
-    confidence = read_study([CONFIG]).metrics.confidence
-    for line in verify.verify(arguments.folder, sample, confidence):
+    for line in verify.verify(arguments.folder, sample):
         print(line, flush=True)
 
 
