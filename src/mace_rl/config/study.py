@@ -128,14 +128,12 @@ class Study(Section):
         return self._resolved[environment, variant].model_copy(update={"seed": seed})
 
 
-def load_study(config: Any, origin: str) -> Study:
+def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     """Check a configuration as a whole, every run's settings included.
 
     `origin` (file names) starts the message of the `ConfigError`, one line with the key, the value
     and what would be right, that the first mistake raises.
     """
-    if not isinstance(config, Mapping):
-        raise ConfigError(f"{origin}: it is {short(config)}, but should be keys with values")
     study = check(Study, {str(key): value for key, value in config.items()}, origin)
     try:
         for variant in study.variants:
