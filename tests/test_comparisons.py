@@ -84,7 +84,7 @@ def test_comparisons_against_scipy_and_enumeration():
     row = together.iloc[0]  # final_return of mace_fixed and ppo
     runs = [frame[frame["env"] == name].set_index("variant") for name in frame["env"].unique()]
     pairs = [
-        [one.loc[name, row["metric"]].to_numpy() for name in (row["variant"], row["baseline"])]
+        [one.loc[name, [row["metric"]]].to_numpy() for name in (row["variant"], row["baseline"])]
         for one in runs
     ]
     expected = probability_of_improvement(pairs, *HOW, generator())

@@ -20,7 +20,7 @@ from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_fig
 from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
-from mace_rl.results.summary import table1
+from mace_rl.results.summary import summary, table1
 from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
@@ -51,8 +51,8 @@ def runs(tmp_path_factory) -> dict[RunKey, pd.DataFrame]:
 
 
 def test_table_1(runs):
-    metrics = metrics_table(runs, STUDY.runs(), METRICS)
-    table = table1(metrics, METRICS)
+    metrics = metrics_table(runs, METRICS)
+    table = table1(summary(metrics, METRICS))
     assert table.to_csv(index=False).encode() == (EXPECTED / "table1.csv").read_bytes()
     latex = table1_latex(table, STUDY.labels, METRICS)
     assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()

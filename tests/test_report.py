@@ -191,8 +191,9 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     chosen = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed"])
     settings = study.metrics.within(study.environments, study.variants)
     settings = settings.model_copy(update={"regret": chosen})
+    runs = [(*key, study.run_config(*key).episodes) for key in study.runs()]
     data, claims = read_data(
-        {path.stem: path for path in (made / "results").glob("*.csv")}, study.runs(), settings
+        {path.stem: path for path in (made / "results").glob("*.csv")}, runs, settings
     )
     assert not claims
     data |= {"figure2": data["figure2"].head(0), "regret": regret(data["metrics"], settings)}

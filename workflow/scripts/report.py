@@ -14,11 +14,10 @@ with job("the report", snakemake.log[0]):
 
     params, records = snakemake.params, [Path(record) for record in snakemake.input.records]
     settings = MetricsConfig.model_validate(params.settings)
-    runs = [tuple(run[:3]) for run in params.runs]
     found = {name: path for name, path in snakemake.input.items() if isinstance(path, str)}
-    data, claims = read_data(found, runs, settings)
+    data, claims = read_data(found, params.runs, settings)
     first = {}  # of the seeds of an environment and variant
-    for (env, variant, _), record in zip(runs, records, strict=True):
+    for (env, variant, *_), record in zip(params.runs, records, strict=True):
         first.setdefault((env, variant), record.parent)
     making = Making(
         command=params.command,

@@ -12,17 +12,16 @@ with job("tables", snakemake.log[0]):
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    metrics = read_metrics(snakemake.input[0], [tuple(run[:3]) for run in params.runs], settings)
+    metrics = read_metrics(snakemake.input[0], params.runs, settings)
+    means = summary.summary(metrics, settings)
     made = {
-        name: make(metrics, settings)
-        for name, make in (
-            ("table1", summary.table1),
-            ("supplement", summary.supplement),
-            ("comparisons", comparisons),
-            ("aggregate", aggregate),
-            *((("regret", regret),) if settings.regret else ()),
-        )
+        "table1": summary.table1(means),
+        "supplement": summary.supplement(means),
+        "comparisons": comparisons(metrics, settings),
+        "aggregate": aggregate(metrics, settings),
     }
+    if settings.regret:
+        made["regret"] = regret(metrics, settings)
     for name, table in made.items():
         write_atomically(output[name], table.to_csv(index=False))
     for name, fragment in (("table1", latex.table1_latex), ("supplement", latex.supplement_latex)):

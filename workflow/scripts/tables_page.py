@@ -18,10 +18,9 @@ with job("the page of tables", snakemake.log[0]):
     settings = MetricsConfig.model_validate(params.settings)
     claims = found.pop("claims", None)
     data = {name: pd.read_csv(path) for name, path in found.items()}
-    runs = [tuple(run[:3]) for run in params.runs]
-    data["metrics"] = read_metrics(found["metrics"], runs, settings)
+    data["metrics"] = read_metrics(found["metrics"], params.runs, settings)
     data["betas"] = read_table(found["betas"], BETAS)
     ledger = json.loads(Path(claims).read_text(encoding="utf-8"))["claims"] if claims else None
-    origin = f"`{params.command}`: {len(runs)} runs."
+    origin = f"`{params.command}`: {len(params.runs)} runs."
     page = tables_page(data, ledger, params.pictures, settings, origin)
     write_atomically(snakemake.output[0], page)

@@ -28,7 +28,6 @@ from mace_rl.results.metrics_table import read_metrics
 from mace_rl.results.paper import has_all
 from mace_rl.results.pictures import PICTURES
 from mace_rl.results.readings import draw_readings
-from mace_rl.results.records import RunKey
 from mace_rl.results.renderings import as_html, number
 from mace_rl.results.summary import from_to
 
@@ -50,7 +49,7 @@ class Making:
 
 
 def read_data(
-    found: Mapping[str, Any], runs: Sequence[RunKey], settings: MetricsConfig
+    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
 ) -> tuple[dict[str, pd.DataFrame], Ledger]:
     """The data of these runs, and the ledger, empty without one, from files by their names."""
     data = {name: pd.read_csv(path) for name, path in found.items() if str(path).endswith(".csv")}

@@ -58,16 +58,13 @@ def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> 
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
     """
-    wanted, found = list(frames), kinds(settings)
-    runs = {RUNS: metrics_table(frames, wanted, settings)}
-    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), wanted, settings)
-    means = {
-        source: summary(table, [metric for _, metric in found], settings)
-        for source, table in runs.items()
-    }
+    found = kinds(settings)
+    runs = {RUNS: metrics_table(frames, settings)}
+    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), settings)
+    means = {source: summary(table, settings) for source, table in runs.items()}
     parts = []
-    for environment in dict.fromkeys(name for name, _, _ in wanted):
-        parts += [_published(environment, kind, wanted) for kind in PAPER_METRICS]
+    for environment in dict.fromkeys(name for name, _, _ in frames):
+        parts += [_published(environment, kind, list(frames)) for kind in PAPER_METRICS]
         for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
             if source == RUNS or metric.name in ASKED_OF_NOISE:
                 table, own = means[source], runs[source]

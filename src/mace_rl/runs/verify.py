@@ -119,9 +119,7 @@ def verdict(results: Sequence[Repetition], confidence: float) -> tuple[bool, str
     spread = np.array([result.spread for result in different])
     if not spread.all():
         return False, f"{line}; where a run's returns are all equal there is no unit of change"
-    change = paired_comparison(
-        now / spread, then / spread, confidence, 10_000, np.random.default_rng(0)
-    )
+    change = paired_comparison((now - then) / spread, confidence, 10_000, np.random.default_rng(0))
     agree = change.low > -MARGIN and change.high < MARGIN
     return bool(agree), (
         f"{line}; the others' mean return changed by {change.difference:+.3f} "
