@@ -7,6 +7,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import readings as r
 from mace_rl.results import tables
+from mace_rl.results.figures import Look
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_TABLE1
 from mace_rl.results.renderings import markdown
@@ -118,5 +119,6 @@ def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> 
     table = r.readings(other, settings)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
-    figure = r.draw_readings(table, {name: name for name in colours}, colours, settings)
+    look = Look(study.figure, 0.95, {name: name for name in colours}, colours)
+    figure = r.draw_readings(table, settings, look)
     assert [axes.get_title() for axes in figure.axes] == ["Other-v0"]

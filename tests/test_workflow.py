@@ -29,11 +29,11 @@ TINY = {  # instead of what config.yaml has
 RUNS = [f"runs/{env}/{variant}/seed0" for env in ENVIRONMENTS for variant in VARIANTS]
 OUTPUTS = [
     *("metrics.csv", "betas.csv", "tables.md", "comparisons.csv", "aggregate.csv", "table1.tex"),
-    *("table1.csv", "table2.tex", "supplement.tex", "supplement.csv", "figure1.csv"),
+    *("table1.csv", "table2.tex", "supplement.csv", "figure1.csv"),
     *("figure1_seeds.csv", "figure2.csv", "figure1.pdf", "figure1.png", "figure2.pdf"),
     "figure2.png",
     *("every_seed.pdf", "every_seed.png", "every_seed.csv"),
-    *("readings.csv", "readings.md", "readings.pdf", "readings.png"),
+    *("readings.csv", "readings.pdf", "readings.png"),
     *(f"{run}/{name}" for run in RUNS for name in ("episodes.csv", "diagnostics.csv", "agent.pt")),
 ]
 EVALUATION = {"metrics": 1, "tables": 1, "tables_page": 1}

@@ -6,10 +6,11 @@ from job import job
 
 with job("the report", snakemake.log[0]):
     from mace_rl.config.agent import PPOConfig
-    from mace_rl.config.results import MetricsConfig
+    from mace_rl.config.results import FigureConfig, MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.report.animations import animations
     from mace_rl.report.page import Making, page, read_data
+    from mace_rl.results.figures import Look
     from mace_rl.runs.provenance import read_record
 
     params, records = snakemake.params, [Path(record) for record in snakemake.input.records]
@@ -26,5 +27,6 @@ with job("the report", snakemake.log[0]):
         records=list(map(read_record, records)),
     )
     films = animations(first, params.labels, Path(snakemake.output[0]).parent)
-    html = page(data, claims, making, films, settings, params.labels, params.colours)
+    look = Look(FigureConfig(columns=3), settings.confidence, params.labels, params.colours)
+    html = page(data, claims, making, films, settings, look)
     write_atomically(snakemake.output[0], html)

@@ -5,9 +5,10 @@ from job import job
 with job("tables", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results import latex, summary
+    from mace_rl.results import summary
     from mace_rl.results.aggregate import aggregate
     from mace_rl.results.comparisons import comparisons, regret
+    from mace_rl.results.latex import table1_latex
     from mace_rl.results.metrics_table import read_metrics
 
     params, output = snakemake.params, snakemake.output
@@ -24,5 +25,4 @@ with job("tables", snakemake.log[0]):
         made["regret"] = regret(metrics, settings)
     for name, table in made.items():
         write_atomically(output[name], table.to_csv(index=False))
-    for name, fragment in (("table1", latex.table1_latex), ("supplement", latex.supplement_latex)):
-        write_atomically(output[f"{name}_tex"], fragment(made[name], params.labels, settings))
+    write_atomically(output.table1_tex, table1_latex(made["table1"], params.labels, settings))

@@ -25,7 +25,6 @@ from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICT
 from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.metrics_table import read_metrics
-from mace_rl.results.paper import has_all
 from mace_rl.results.pictures import PICTURES
 from mace_rl.results.readings import draw_readings
 from mace_rl.results.renderings import as_html, number
@@ -64,8 +63,7 @@ def page(
     making: Making,
     animations: Animations,
     settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> str:
     """The page as HTML; equal arguments give an equal page."""
     environment = jinja2.Environment(
@@ -77,15 +75,12 @@ def page(
     )
     environment.filters |= {"short": short, "duration": duration, "table": as_html}
     metrics, records = data["metrics"], making.records
-    environments = list(metrics["env"].unique())
     counts = {how: Counter(claim[how]["verdict"] for claim in claims) for how in (LITERAL, ROBUST)}
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
         counts=counts,
-        no_common_bar=has_all(metrics["env"], labels) and not settings.reference_return,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
-        few=_too_few(claims, environments),
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),
@@ -94,16 +89,16 @@ def page(
         interruptions=sum(len(record["interruptions"]) for record in records),
         confidence=f"{100 * settings.confidence:g} %",
         window=settings.moving_average,
-        environments=environments,
-        labels=labels,
-        colours={variant: to_hex(colour) for variant, colour in colours.items()},
+        environments=list(metrics["env"].unique()),
+        labels=look.labels,
+        colours={variant: to_hex(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
-        figures=_figures(data, settings, labels, colours),
+        figures={figure: _panels(data, figure, settings, look) for figure in FIGURES},
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
         animations=animations,
-        pictures=_pictures(data, claims, settings, labels, colours),
-        tables=_tables(data, making, settings, labels),
-        parts=lambda claim, how: _parts(claim, how, settings, labels),
+        pictures=_pictures(data, claims, settings, look),
+        tables=_tables(data, making, settings, look.labels),
+        parts=lambda claim, how: _parts(claim, how, settings, look.labels),
         making=making,
         origins=_origins(records),
     )
@@ -123,46 +118,27 @@ def duration(seconds: float) -> str:
     return f"{number(seconds, 1)} s"
 
 
-def _too_few(claims: Ledger, environments: Sequence[str]) -> list[str]:
-    """Those of the environments in which a claim's part has fewer seeds than the rule asks for."""
-    parts = [part for claim in claims for part in claim[ROBUST]["parts"]]
-    few = {env for part in parts if part["seeds"] < FEWEST_SEEDS for env in part["environments"]}
-    return [environment for environment in environments if environment in few]
-
-
-def _figures(
-    data: Data, settings: MetricsConfig, labels: Mapping[str, str], colours: Mapping[str, str]
-) -> dict[str, dict[str, str]]:
-    """Figures 1 and 2, panel by panel."""
-    return {
-        figure: panels(
-            data[f"figure{figure}"],
-            data[f"figure{figure}_seeds"],
-            quantity(figure, settings),
-            settings,
-            labels,
-            colours,
-        )
-        for figure in FIGURES
-    }
+def _panels(data: Data, figure: str, settings: MetricsConfig, look: Look) -> dict[str, str]:
+    """Figure 1 or 2, panel by panel."""
+    curves, seeds = data[f"figure{figure}"], data[f"figure{figure}_seeds"]
+    return panels(curves, seeds, quantity(figure, settings), look)
 
 
 def _pictures(
     data: Data,
     claims: Ledger,
     settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> dict[str, str]:
     """Those that are wider than a phone, as SVG by name; those that this study has data for."""
-    look = Look(FigureConfig(columns=3), settings.confidence, labels, colours)
+    look = look._replace(layout=FigureConfig(columns=3))
     made_of = {
         "every_seed": data["metrics"],
         "constants": data["metrics"] if settings.regret else None,
         "solved": data["metrics"] if settings.solved_return else None,
         "forest": claims or None,
     }
-    drawn = {"readings": draw_readings(data["readings"], labels, colours, settings)}
+    drawn = {"readings": draw_readings(data["readings"], settings, look)}
     for name, found in made_of.items():
         if found is not None:
             drawn[name] = PICTURES[name].draw(PICTURES[name].data(found, settings), look)

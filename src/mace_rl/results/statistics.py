@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
 
+from mace_rl.config.results import MetricsConfig
+
 BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
 CHUNK = 2**20  # resampled values held in memory at a time
 BATCH = 1000  # resamples of a test at a time: faster than all 10000, which caches cannot hold
@@ -53,6 +55,12 @@ def mean_interval(
     ]
     low, high = np.concatenate(bounds, axis=1)
     return low.reshape(mean.shape), high.reshape(mean.shape)
+
+
+def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, np.ndarray]:
+    """`mean_interval` as configured, from a generator of its own: none depends on another."""
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    return mean_interval(values, settings.confidence, settings.bootstrap_repetitions, generator)
 
 
 def paired_comparison(

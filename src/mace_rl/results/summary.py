@@ -8,7 +8,7 @@ import pandas as pd
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import interval
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
 
@@ -28,12 +28,7 @@ def summary(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         paper = dict(zip(PAPER_METRICS, published, strict=False))  # empty if it has none
         for metric in all_metrics(settings):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
-            low, high = mean_interval(  # a generator of its own: no cell depends on another
-                values,
-                settings.confidence,
-                settings.bootstrap_repetitions,
-                np.random.default_rng(settings.bootstrap_seed),
-            )
+            low, high = interval(values, settings)
             limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
             low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
             rows.append(
