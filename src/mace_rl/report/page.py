@@ -20,7 +20,7 @@ from mace_rl.config.agent import PPOConfig
 from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.report.animations import Animations
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
-from mace_rl.results import tables
+from mace_rl.results import pages, tables
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICTS
 from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
@@ -75,10 +75,9 @@ def page(
     )
     environment.filters |= {"short": short, "duration": duration, "table": as_html}
     metrics, records = data["metrics"], making.records
-    counts = {how: Counter(claim[how]["verdict"] for claim in claims) for how in (LITERAL, ROBUST)}
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
-        counts=counts,
+        counted=pages.counted,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
         fewest=FEWEST_SEEDS,

@@ -57,7 +57,7 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         for name, estimate in (("mean", np.mean), ("iqm", interquartile_mean)):
             resampled = estimate(drawn, axis=-1)
             low, high = percentiles(resampled, settings.confidence, smallest)
-            value = estimate(np.concatenate(strata), axis=-1)
+            value = float(estimate(np.concatenate(strata), axis=-1))
             row |= {name: value, f"{name}_low": low, f"{name}_high": high}
         rows.append(row)
     return pd.DataFrame(rows)
