@@ -16,7 +16,14 @@ from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import read_study
-from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.figures import (
+    Look,
+    draw_figure,
+    mean_curves,
+    quantity,
+    save_figure,
+    seed_curves,
+)
 from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
@@ -62,15 +69,9 @@ def test_table_1(runs):
 def test_figures(runs, tmp_path, number):
     shown = quantity(number, STUDY.metrics)
     single_seeds = seed_curves(runs, shown)
-    figure = draw_figure(
-        mean_curves(single_seeds, shown, STUDY.metrics),
-        single_seeds,
-        shown,
-        STUDY.figure,
-        STUDY.metrics.confidence,
-        STUDY.labels,
-        STUDY.colours,
-    )
+    look = Look(STUDY.figure, STUDY.metrics.confidence, STUDY.labels, STUDY.colours)
+    curves = mean_curves(single_seeds, shown, STUDY.metrics)
+    figure = draw_figure(curves, single_seeds, shown, look)
     name = f"figure{number}.png"
     save_figure(figure, tmp_path / name)
     assert (tmp_path / name).read_bytes() == (EXPECTED / name).read_bytes()
