@@ -220,14 +220,14 @@ def test_agents_that_do_the_same_untrained_share_a_film(
     hopper, seed1 = made / "results/runs/HopperBulletEnv-v0", tmp_path / "seed1"
     runs = {("HopperBulletEnv-v0", variant): hopper / variant / "seed0" for variant in VARIANTS}
     labels = {variant: variant.upper() for variant in VARIANTS}
-    before, *after = animations(runs, labels, made / "results").shown["HopperBulletEnv-v0"]
+    before, *after = animations(runs, labels, made / "results")[0]["HopperBulletEnv-v0"]
     assert (before.title, before.variants, before.trained) == ("Before training", VARIANTS, False)
     assert [(one.title, one.variants, one.trained) for one in after] == [
         (labels[variant], (variant,), True) for variant in VARIANTS
     ]
     shutil.copytree(hopper / "ppo/seed1", seed1)
     runs["HopperBulletEnv-v0", "ppo"] = seed1
-    first, second, *_ = animations(runs, labels, tmp_path).shown["HopperBulletEnv-v0"]
+    first, second, *_ = animations(runs, labels, tmp_path)[0]["HopperBulletEnv-v0"]
     assert first.title == "Before training: PPO"
     assert second.title == "Before training: MACE_FIXED, MACE_FULL"
     (seed1 / files.AGENT).write_bytes(b"another")
@@ -235,9 +235,9 @@ def test_agents_that_do_the_same_untrained_share_a_film(
         animations({("HopperBulletEnv-v0", "ppo"): seed1}, labels, tmp_path)
     # An environment that cannot be drawn is said.
     run(run_config("PlantedHelp-v0", episodes=1), tmp_path / "planted")
-    films = animations({("PlantedHelp-v0", "ppo"): tmp_path / "planted"}, labels, tmp_path)
-    assert not films.shown
-    assert films.missing[0].startswith("environment 'PlantedHelp-v0' cannot be drawn")
+    shown, missing = animations({("PlantedHelp-v0", "ppo"): tmp_path / "planted"}, labels, tmp_path)
+    assert not shown
+    assert missing[0].startswith("environment 'PlantedHelp-v0' cannot be drawn")
 
 
 def test_costs_and_times() -> None:

@@ -18,7 +18,7 @@ from matplotlib.colors import to_hex
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.results import FigureConfig, MetricsConfig
-from mace_rl.report.animations import Animations
+from mace_rl.report.animations import Animation
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.results import pages, tables
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICTS
@@ -61,7 +61,7 @@ def page(
     data: Data,
     claims: Ledger,
     making: Making,
-    animations: Animations,
+    animations: tuple[Mapping[str, Sequence[Animation]], Sequence[str]],
     settings: MetricsConfig,
     look: Look,
 ) -> str:
@@ -94,7 +94,8 @@ def page(
         page_colours=PAGE_COLOURS,
         figures={figure: _panels(data, figure, settings, look) for figure in FIGURES},
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
-        animations=animations,
+        shown=animations[0],
+        missing=animations[1],
         pictures=_pictures(data, claims, settings, look),
         tables=_tables(data, making, settings, look.labels),
         parts=lambda claim, how: _parts(claim, how, settings, look.labels),

@@ -81,9 +81,10 @@ def _means(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterato
     """What each variant reached in each environment."""
     runs, table1, supplement = data["metrics"], data["table1"], data["supplement"]
     interval = f"{100 * settings.confidence:g} % interval"
+    seeds = from_to(runs.groupby(["env", "variant"]).size())
     for metric, title in RETURNS.items():
         frame = tables.means(supplement, metric, settings)
-        yield _section(title, f"Mean over {_seeds(runs)} seeds ({interval}).", frame)
+        yield _section(title, f"Mean over {seeds} seeds ({interval}).", frame)
     frame = tables.worst(runs, settings)
     yield _section("Final return of the worst seed", "", frame)
     if "solved" in runs:
@@ -95,10 +96,6 @@ def _means(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterato
         " whole budget, so the mean is a lower bound."
     )
     yield _section("Table 1", note, tables.table1(table1))
-
-
-def _seeds(runs: pd.DataFrame) -> str:
-    return from_to(runs.groupby(["env", "variant"]).size())
 
 
 def _compared(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
