@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import SEEDS, table_for_scores, table_for_tables
+from invented import SEEDS, expanded, table_for_scores, table_for_tables
 
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import Study, read_study
@@ -28,12 +28,6 @@ HOW = (0.95, SETTINGS.bootstrap_repetitions)
 
 def generator():
     return np.random.default_rng(SETTINGS.bootstrap_seed)
-
-
-def expanded(drawn, seeds):
-    """The bounds of an expanded percentile interval."""
-    z = np.sqrt(seeds / (seeds - 1)) * scipy.stats.t.ppf(0.975, seeds - 1)
-    return np.quantile(drawn, scipy.stats.norm.cdf([-z, z]))
 
 
 def test_which_pairs_are_compared_where():

@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from invented import expanded
 
 from mace_rl.results import statistics as s
 
@@ -30,12 +31,6 @@ def interval(values, seed=0):
 
 def paired(x, y):
     return s.paired_comparison(x - y, *HOW, generator())
-
-
-def expanded(resampled, seeds):
-    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
-    z = scipy.stats.t.ppf(0.975, seeds - 1) * np.sqrt(seeds / (seeds - 1))
-    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))
 
 
 def test_below_ten_seeds_the_interval_is_students_and_then_the_expanded_bootstrap():
