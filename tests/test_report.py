@@ -20,11 +20,12 @@ from mace_rl import files
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import read_study
 from mace_rl.report.animations import animations
-from mace_rl.report.page import Making, _costs, duration, read_data, short
+from mace_rl.report.page import Making, _costs, duration, short
 from mace_rl.report.page import page as build
 from mace_rl.results.claims import LITERAL, ROBUST
 from mace_rl.results.comparisons import regret
 from mace_rl.results.figures import Look
+from mace_rl.results.pages import read_data
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
 from mace_rl.results.renderings import number
 from mace_rl.runs.checkpoint import CheckpointError

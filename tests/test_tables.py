@@ -331,5 +331,5 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
     alone = {name: make(runs.iloc[:10], settings) for name, make in list(kinds.items())[:4]}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}
-    page = tables_page(alone, None, [], SETTINGS, "")
+    page = tables_page(alone, (), [], SETTINGS, "")
     assert not re.search("who is better|claims|environments together|## β|!\\[|nan", page)

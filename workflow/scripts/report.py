@@ -9,8 +9,9 @@ with job("the report", snakemake.log[0]):
     from mace_rl.config.results import FigureConfig, MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.report.animations import animations
-    from mace_rl.report.page import Making, page, read_data
+    from mace_rl.report.page import Making, page
     from mace_rl.results.figures import Look
+    from mace_rl.results.pages import read_data
     from mace_rl.runs.provenance import read_record
 
     params, records = snakemake.params, [Path(record) for record in snakemake.input.records]

@@ -4,7 +4,6 @@ One file that needs nothing else: pictures and styles stand in it, there is no s
 content security policy has the browser refuse whatever would be loaded.
 """
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,7 +23,7 @@ from mace_rl.results import pages, tables
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICTS
 from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
-from mace_rl.results.metrics_table import read_metrics
+from mace_rl.results.pages import Data, Ledger
 from mace_rl.results.pictures import PICTURES
 from mace_rl.results.readings import draw_readings
 from mace_rl.results.renderings import as_html, number
@@ -33,8 +32,6 @@ from mace_rl.results.summary import from_to
 TEMPLATE = Path(__file__).with_name("page.html")
 FIGURES = ("1", "2")
 MINUTE, HOUR = 60, 3600
-Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
-Ledger = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -45,16 +42,6 @@ class Making:
     configuration: Mapping[str, str]  # text by file, in the order in which they are read
     ppo: Mapping[str, PPOConfig]  # by environment
     records: Sequence[Mapping[str, Any]]  # the `run.json` of every run
-
-
-def read_data(
-    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
-) -> tuple[dict[str, pd.DataFrame], Ledger]:
-    """The data of these runs, and the ledger, empty without one, from files by their names."""
-    data = {name: pd.read_csv(path) for name, path in found.items() if str(path).endswith(".csv")}
-    data["metrics"] = read_metrics(found["metrics"], runs, settings)
-    path = found.get("claims")
-    return data, json.loads(Path(path).read_text(encoding="utf-8"))["claims"] if path else ()
 
 
 def page(
