@@ -74,7 +74,7 @@ def main() -> None:
         cells.append(f"{values.mean():z.2f} ({low:z.2f} to {high:z.2f})")
     print("| mean |", " | ".join(cells), "|\n")
     for name, (without, with_curiosity) in zip(MEASURES, found, strict=True):
-        gain = paired_comparison(with_curiosity, without, 0.95, 10_000, rng)
+        gain = paired_comparison(with_curiosity - without, 0.95, 10_000, rng)
         interval = f"{gain.difference:z.2f} ({gain.low:z.2f} to {gain.high:z.2f})"
         print(f"with curiosity minus without, {name}: {interval}, p = {gain.p_value:.4f}")
 

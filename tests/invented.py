@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+import scipy.stats
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import check
@@ -109,3 +110,9 @@ def table_for_scores(seeds: dict[str, int]) -> pd.DataFrame:
     for metric in SCORED:
         frame[metric] = draws.normal(300, 50, len(frame)).round(1)
     return frame
+
+
+def expanded(resampled: Sequence[float] | np.ndarray, seeds: int) -> np.ndarray:
+    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
+    z = scipy.stats.t.ppf(0.975, seeds - 1) * np.sqrt(seeds / (seeds - 1))
+    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))

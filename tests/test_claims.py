@@ -1,11 +1,5 @@
 """The verdicts on the paper's claims, from tables in which the truth is known."""
 
-import json
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +10,6 @@ from mace_rl.config.study import Study
 from mace_rl.results import claims
 from mace_rl.results.claims import CLAIMS, CORRELATION, LITERAL, ROBUST
 
-ROOT = Path(__file__).parents[1]
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
 PLAIN = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
@@ -165,38 +158,3 @@ def test_variants_of_different_budgets_are_compared_within_the_shorter(study: St
     over_ppo, over_fixed = parts_of(frame, study, "C5")
     assert (over_ppo["difference"], over_ppo["probability"]) == (0, 0.5)
     assert (over_ppo["worth_mentioning"], over_fixed["worth_mentioning"]) == (100, 25)
-
-
-def test_seeds_have_to_be_the_same(study: Study) -> None:
-    frame = table_for_claims(5, EQUAL, noise=0.1)
-    frame = frame[~((frame["variant"] == "ppo") & (frame["seed"] == 3))]
-    with pytest.raises(ValueError, match="do not have the same seeds"):
-        claims.ledger(frame, study.metrics)
-
-
-@pytest.mark.slow
-def test_the_documented_study_of_one_seed_gets_its_ledger(study: Study, tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "reference" / "runs", tmp_path / "runs")
-    command = "-m snakemake --cores 1 --allowed-rules metrics claims"
-    command += f" --configfile config/reference.yaml --config results={tmp_path}"
-    subprocess.run(
-        [sys.executable, *command.split(), "--", f"{tmp_path}/claims.json"],
-        check=True,
-        capture_output=True,
-        cwd=ROOT,
-    )
-    found = json.loads((tmp_path / "claims.json").read_text())
-    seconds = [json.loads(path.read_text())["seconds"] for path in tmp_path.rglob("run.json")]
-    assert found["cost"]["runs"] == len(seconds) == 9
-    assert found["cost"]["core_hours"] == pytest.approx(sum(seconds) / 3600)
-    assert {claim[ROBUST]["verdict"] for claim in found["claims"]} == {"inconclusive"}
-    (parts,) = (claim[ROBUST]["parts"] for claim in found["claims"] if claim["claim"] == "C9")
-    assert len(parts) == 3
-    window = study.metrics.moving_average
-    for part in parts:
-        (run,) = (tmp_path / "runs" / part["environments"][0] / "mace_full").glob("seed*")
-        records = pd.read_csv(run / "episodes.csv")
-        average = records["extrinsic_return"].rolling(window).mean()
-        rise = average.diff(window) / window
-        expected = (-rise).corr(records["beta"].shift(-1), method="spearman")
-        assert part["difference"] == pytest.approx(expected)

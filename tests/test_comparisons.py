@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import SEEDS, table_for_scores, table_for_tables
+from invented import SEEDS, expanded, table_for_scores, table_for_tables
 
 from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import Study, read_study
@@ -28,12 +28,6 @@ HOW = (0.95, SETTINGS.bootstrap_repetitions)
 
 def generator():
     return np.random.default_rng(SETTINGS.bootstrap_seed)
-
-
-def expanded(drawn, seeds):
-    """The bounds of an expanded percentile interval."""
-    z = np.sqrt(seeds / (seeds - 1)) * scipy.stats.t.ppf(0.975, seeds - 1)
-    return np.quantile(drawn, scipy.stats.norm.cdf([-z, z]))
 
 
 def test_which_pairs_are_compared_where():
@@ -84,7 +78,7 @@ def test_comparisons_against_scipy_and_enumeration():
     row = together.iloc[0]  # final_return of mace_fixed and ppo
     runs = [frame[frame["env"] == name].set_index("variant") for name in frame["env"].unique()]
     pairs = [
-        [one.loc[name, row["metric"]].to_numpy() for name in (row["variant"], row["baseline"])]
+        [one.loc[name, [row["metric"]]].to_numpy() for name in (row["variant"], row["baseline"])]
         for one in runs
     ]
     expected = probability_of_improvement(pairs, *HOW, generator())
@@ -184,10 +178,6 @@ def test_the_interval_of_regret_chooses_the_best_constant_anew():
     for name, drawn in regrets.items():
         found, expected = result.loc[name, ["low", "high"]].astype(float), expanded(drawn, 8)
         np.testing.assert_allclose(found, expected, atol=0.12 * np.ptp(expected))
-    # The best of three equal constants is lucky: a variant that is just as good has a regret.
-    equal = dict.fromkeys(AREAS["CartPole-v1"], 100.0)
-    lucky = [regret_of(noise=20, draw=draw, **equal)[0].loc["all", "regret"] for draw in range(20)]
-    assert np.mean(lucky) > 2 * scipy.stats.sem(lucky)
 
 
 def test_environments_are_measured_apart_and_may_have_different_seeds():

@@ -12,10 +12,16 @@ import pytest
 import scipy.stats
 
 from mace_rl.config.results import FigureConfig
-from mace_rl.config.section import ConfigError, check
 from mace_rl.config.study import read_study
 from mace_rl.report.panels import MAX_POINTS, _thinned
-from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.figures import (
+    Look,
+    draw_figure,
+    mean_curves,
+    quantity,
+    save_figure,
+    seed_curves,
+)
 from mace_rl.results.records import RecordError
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
@@ -45,7 +51,8 @@ def data(shown=RETURN, runs=None, **shape):
 
 def draw(colours=COLOURS, shown=RETURN, runs=None, inset=None, **shape):
     layout = FigureConfig(columns=3, inset=inset)
-    return draw_figure(*data(shown, runs, **shape), shown, layout, 0.95, LABELS, colours)
+    look = Look(layout, 0.95, LABELS, colours)
+    return draw_figure(*data(shown, runs, **shape), shown, look)
 
 
 def at(frame, **values):
@@ -141,12 +148,6 @@ def test_the_same_data_gives_the_same_file_and_another_colour_does_not(tmp_path,
     if kind == "pdf":  # vectors, and fonts that journals take
         assert b"/FontFile2" in contents[0]
         assert not any(word in contents[0] for word in (b"/Type3", b"/Subtype /Image", b"Creat"))
-
-
-@pytest.mark.parametrize("columns", [0, -1, 1.5, "3", None])
-def test_columns_are_a_positive_number(columns):
-    with pytest.raises(ConfigError, match="figure: columns is"):
-        check(FigureConfig, {"columns": columns}, "figure")
 
 
 @pytest.mark.slow

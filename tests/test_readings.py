@@ -7,6 +7,7 @@ import pytest
 from mace_rl.config.study import Study
 from mace_rl.results import readings as r
 from mace_rl.results import tables
+from mace_rl.results.figures import Look
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_TABLE1
 from mace_rl.results.renderings import markdown
@@ -41,7 +42,7 @@ def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
     frames: Frames, study: Study
 ) -> None:
     table = r.readings(frames, study.metrics)
-    runs = metrics_table(frames, list(frames), study.metrics)
+    runs = metrics_table(frames, study.metrics)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     expected = runs.groupby("variant")["sample_efficiency_range"].mean()
     assert rows["mean"].to_dict() == pytest.approx(expected.to_dict())
@@ -100,7 +101,7 @@ def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None
             frames["CartPole-v1", variant, seed] = records(returns)
     rows = select(r.readings(frames, study.metrics), "sample_efficiency_range", r.RUNS)
     assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
-    runs = metrics_table(frames, list(frames), study.metrics).set_index("variant")
+    runs = metrics_table(frames, study.metrics).set_index("variant")
     times = {name: runs.loc[name, "sample_efficiency_range"].to_numpy(float) for name in rows.index}
     times["mace_full"][3:] = np.inf
     expected = logrank(times["ppo"], times["mace_full"], 9999, np.random.default_rng(0))
@@ -118,5 +119,6 @@ def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> 
     table = r.readings(other, settings)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
-    figure = r.draw_readings(table, {name: name for name in colours}, colours, settings)
+    look = Look(study.figure, 0.95, {name: name for name in colours}, colours)
+    figure = r.draw_readings(table, settings, look)
     assert [axes.get_title() for axes in figure.axes] == ["Other-v0"]

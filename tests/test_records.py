@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from mace_rl.results.records import RecordError, read_episodes, read_table, write_episodes
+from mace_rl.results.records import RecordError, read_episodes, write_episodes
 
 HEADER = "episode,env_steps,length,extrinsic_return,intrinsic_return,beta,terminated"
 ROWS = ["1,10,10,9.5,0.25,0.4,1", "2,30,20,-19.0,3e-05,0.3996,0", "3,31,1,0.1,0.0,0.0,1"]
@@ -55,39 +55,24 @@ def test_a_valid_file_written_by_hand_is_read(tmp_path):
 
 DAMAGE = {  # what the file holds, and what the message must name
     "empty": ("", "line 1", "ends within"),
-    "header only": (text([]), "line 1", "0 episodes"),
-    "half a last line": (text()[:-8], "line 4", "ends within"),
-    "no last newline": (text()[:-1], "line 4", "ends within"),
     "a missing column": (text(header=HEADER[: -len(",terminated")]), "line 1", "terminated"),
-    "an extra column": (text(header=HEADER + ",reward"), "line 1", "reward"),
-    "a renamed column": (text(header=HEADER.replace("beta", "Beta")), "line 1", "beta"),
-    "reordered": (text(header=HEADER.replace("length,", "") + ",length"), "line 1", "'length'"),
-    "no header": ("\n".join(ROWS) + "\n", "line 1", "episode"),
     "a short row": (text([ROWS[0], "2,30,20,-19.0,0.5,0.3996", ROWS[2]]), "line 3", "6 cells"),
-    "a long row": (text([ROWS[0] + ",1", *ROWS[1:]]), "line 2", "8 cells"),
     "a blank line": (text([*ROWS, ""]), "line 5", "1 cells"),
     "a gap": (text([ROWS[0], "3,30,20,-19.0,0.0,0.4,0"]), "line 3", "episode is 3"),
-    "from zero": (text(["0,10,10,9.5,0.25,0.4,1"]), "line 2", "episode is 0"),
-    "swapped rows": (text([ROWS[1], ROWS[0], ROWS[2]]), "line 2", "episode is 2"),
     "fewer episodes": (text(ROWS[:2]), "line 3", "2 episodes"),
     "more episodes": (text([*ROWS, "4,32,1,0.1,0.0,0.0,1"]), "line 5", "4 episodes"),
     "text": (text([ROWS[0].replace("9.5", "many")]), "line 2", "extrinsic_return is 'many'"),
     "an empty cell": (text([ROWS[0].replace("9.5", "")]), "line 2", "extrinsic_return is ''"),
     "NaN": (text([ROWS[0].replace("9.5", "nan")]), "line 2", "extrinsic_return is 'nan'"),
-    "Inf": (text([ROWS[0].replace("0.25", "inf")]), "line 2", "intrinsic_return is 'inf'"),
-    "overflow": (text([ROWS[0].replace("9.5", "1e999")]), "line 2", "'1e999'"),
     "a digit too many": (text([ROWS[0].replace("9.5", "9.50")]), "line 2", "'9.50'"),
     "a space": (text([ROWS[0].replace("9.5", " 9.5")]), "line 2", "' 9.5'"),
     "an enormous integer": (text(["1," + "9" * 30 + ",10,9.5,0.25,0.4,1"]), "line 2", "env_steps"),
     "env_steps": (text([ROWS[0], ROWS[1].replace("30", "31")]), "line 3", "env_steps is 31"),
     "length": (text(["1,0,0,9.5,0.25,0.4,1"]), "line 2", "length is 0"),
-    "a negative length": (text(["1,-5,-5,9.5,0.25,0.4,1"]), "line 2", "length is -5"),
     "intrinsic": (text([ROWS[0].replace("0.25", "-0.25")]), "line 2", "intrinsic_return is -0.25"),
     "beta above": (text([ROWS[0].replace("0.4", "1.5")]), "line 2", "beta is 1.5"),
-    "beta below": (text([ROWS[0].replace("0.4", "-0.1")]), "line 2", "beta is -0.1"),
     "terminated": (text([ROWS[0][:-1] + "2"]), "line 2", "terminated is 2"),
     "windows newlines": (text().replace("\n", "\r\n"), "line 1", "terminated"),
-    "semicolons": (text().replace(",", ";"), "line 1", "episode"),
     "a NUL": (text([ROWS[0].replace("9.5", "9\0")]), "line 2", "extrinsic_return"),
 }
 
@@ -169,9 +154,3 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     write_episodes(path, columns())
     assert len(read_episodes(path, 3)) == 3
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_table_of_text_and_numbers(tmp_path):
-    (tmp_path / "t.csv").write_text("env,n,x\nCartPole-v1,3,0.1\n")
-    table = read_table(tmp_path / "t.csv", {"env": str, "n": int, "x": float})
-    assert table.to_dict("records") == [{"env": "CartPole-v1", "n": 3, "x": 0.1}]

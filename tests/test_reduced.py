@@ -16,11 +16,18 @@ from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import read_study
-from mace_rl.results.figures import draw_figure, mean_curves, quantity, save_figure, seed_curves
+from mace_rl.results.figures import (
+    Look,
+    draw_figure,
+    mean_curves,
+    quantity,
+    save_figure,
+    seed_curves,
+)
 from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.records import RunKey, read_episodes
-from mace_rl.results.summary import table1
+from mace_rl.results.summary import summary, table1
 from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
@@ -51,8 +58,8 @@ def runs(tmp_path_factory) -> dict[RunKey, pd.DataFrame]:
 
 
 def test_table_1(runs):
-    metrics = metrics_table(runs, STUDY.runs(), METRICS)
-    table = table1(metrics, METRICS)
+    metrics = metrics_table(runs, METRICS)
+    table = table1(summary(metrics, METRICS))
     assert table.to_csv(index=False).encode() == (EXPECTED / "table1.csv").read_bytes()
     latex = table1_latex(table, STUDY.labels, METRICS)
     assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()
@@ -62,15 +69,9 @@ def test_table_1(runs):
 def test_figures(runs, tmp_path, number):
     shown = quantity(number, STUDY.metrics)
     single_seeds = seed_curves(runs, shown)
-    figure = draw_figure(
-        mean_curves(single_seeds, shown, STUDY.metrics),
-        single_seeds,
-        shown,
-        STUDY.figure,
-        STUDY.metrics.confidence,
-        STUDY.labels,
-        STUDY.colours,
-    )
+    look = Look(STUDY.figure, STUDY.metrics.confidence, STUDY.labels, STUDY.colours)
+    curves = mean_curves(single_seeds, shown, STUDY.metrics)
+    figure = draw_figure(curves, single_seeds, shown, look)
     name = f"figure{number}.png"
     save_figure(figure, tmp_path / name)
     assert (tmp_path / name).read_bytes() == (EXPECTED / name).read_bytes()

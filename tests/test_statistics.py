@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from invented import expanded
 
 from mace_rl.results import statistics as s
 
@@ -29,13 +30,7 @@ def interval(values, seed=0):
 
 
 def paired(x, y):
-    return s.paired_comparison(x, y, *HOW, generator())
-
-
-def expanded(resampled, seeds):
-    """Bounds that a t interval of as many seeds would have, if `resampled` were normal."""
-    z = scipy.stats.t.ppf(0.975, seeds - 1) * np.sqrt(seeds / (seeds - 1))
-    return np.quantile(resampled, scipy.stats.norm.cdf([-z, z]))
+    return s.paired_comparison(x - y, *HOW, generator())
 
 
 def test_below_ten_seeds_the_interval_is_students_and_then_the_expanded_bootstrap():
@@ -90,15 +85,6 @@ def test_paired_comparison_against_scipy_and_enumeration():
     assert one.difference == 16 and np.isnan(one[1:]).all()
 
 
-def test_pairing_finds_a_small_difference_behind_large_seed_effects():
-    noise = generator(5).normal(size=8) * 1000
-    shifted = noise + 1 + generator(6).normal(size=8) * 0.1
-    result = paired(shifted, noise)
-    assert result.low > 0.8
-    assert result.p_value == 2 / 2**8  # no smaller p value exists for eight seeds
-    assert scipy.stats.ttest_ind(shifted, noise).pvalue > 0.9
-
-
 def test_stratified_comparison():
     draws = generator()
     strata = [draws.normal(1.0, 1, 20), draws.normal(0.2, 3, 12)]
@@ -110,7 +96,7 @@ def test_stratified_comparison():
     signs = [draws.choice([-1, 1], (20_000, len(values))) for values in strata]
     flipped = np.mean([(x * v).mean(axis=1) for x, v in zip(signs, strata, strict=True)], axis=0)
     assert found.p_value == pytest.approx(np.mean(abs(flipped) >= found.difference), abs=0.02)
-    one = s.paired_comparison(strata[0], np.zeros(20), 0.95, 1000, generator(3))
+    one = s.paired_comparison(strata[0], 0.95, 1000, generator(3))
     assert s.stratified_comparison(strata[:1], 0.95, 1000, generator(3)) == one
 
 
@@ -127,21 +113,22 @@ def test_strata_of_few_seeds_have_students_interval_with_the_freedom_of_the_smal
 def test_probability_of_improvement_against_a_loop_and_scipy():
     """The mean over environments, resampled within each."""
     pairs = [(TWELVE, TWELVE[:10] ** 2 / 5), (TWELVE - 1, TWELVE)]
-    probability, low, high = s.probability_of_improvement(pairs, *HOW, generator())
+    columns = [(x[:, None], y[:, None]) for x, y in pairs]
+    probability, low, high = s.probability_of_improvement(columns, *HOW, generator())
     u = [scipy.stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)) for x, y in pairs]
     assert probability == pytest.approx(np.mean(u))  # rliable's formula
     draws, resampled = generator(7), []
     for _ in range(REPETITIONS):
         drawn = [(draws.choice(x, len(x)), draws.choice(y, len(y))) for x, y in pairs]
         resampled.append(np.mean([np.heaviside(np.subtract.outer(*d), 0.5).mean() for d in drawn]))
-    np.testing.assert_allclose((low, high), expanded(resampled, 10), atol=0.03)
+    np.testing.assert_allclose((low[0], high[0]), expanded(resampled, 10), atol=0.03)
 
 
 @pytest.mark.parametrize(
     ("x", "y", "expected"), [([2, 3], [0, 1], 1), ([0, 1], [2, 3], 0), ([1, 1], [1, 1], 0.5)]
 )
 def test_probability_of_improvement_at_its_limits(x, y, expected):
-    pair = np.array(x, float), np.array(y, float)
+    pair = np.array(x, float)[:, None], np.array(y, float)[:, None]
     assert s.probability_of_improvement([pair], *HOW, generator()) == (expected,) * 3
     value, *bounds = s.probability_of_improvement([(pair[0][:1], pair[1])], *HOW, generator())
     assert value == expected and np.isnan(bounds).all()
@@ -156,12 +143,6 @@ def test_holm_against_a_loop(p):
         max(min(1, ordered[i] * (m - i)) for i in range(m) if ordered[i] <= value) for value in p
     ]
     assert s.holm(p).tolist() == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("p", [[-0.1], [1.1, 0.5], [float("nan")]])
-def test_holm_refuses_what_is_no_p_value(p):
-    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
-        s.holm(p)
 
 
 def observed_minus_expected(x, y):

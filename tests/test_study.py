@@ -43,6 +43,17 @@ metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'm
 variant_settings: {mace_full: {beta: {flor: 0}}}  # variant_settings.mace_full, 'beta.flor'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
 variant_settings: {mace_fixed: {beta: {initial: DELETE}}}  # mace_fixed, 'beta.initial', missing
+metrics: {treshold: 0.5}  # 'metrics.treshold', 'threshold'
+metrics: {confidence: 95}  # metrics.confidence, 95, less than 1
+metrics: {final_fraction: 0}  # metrics.final_fraction, 0, greater than 0
+metrics: {moving_average: 50.5}  # metrics.moving_average, 50.5
+metrics: {convergence_slope: 1.0}  # metrics.convergence_slope, 1.0, less than 1
+metrics: {bootstrap_repetitions: 99}  # metrics.bootstrap_repetitions, 99, 100
+metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-v1, nan, finite
+metrics: {random_return: {CartPole-v1: "22"}}  # metrics.random_return.CartPole-v1, '22', number
+metrics: {regret: {variant: mace_full, constants: []}}  # metrics.regret.constants, [], 1 item
+figure: {columns: 0}  # figure.columns, 0, greater than 0
+figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
 training: {ppo: {clip: high}}  # training, ppo.clip, 'high', number

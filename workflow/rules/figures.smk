@@ -73,9 +73,6 @@ rule readings:
         records=RECORDS,
     output:
         table=f"{RESULTS}/readings.csv",
-        markdown=report(
-            f"{RESULTS}/readings.md", caption="../report/readings.rst", category="Supplement"
-        ),
         png=report(
             f"{RESULTS}/readings.png", caption="../report/readings.rst", category="Supplement"
         ),
@@ -84,6 +81,7 @@ rule readings:
         f"{RESULTS}/logs/readings.log",
     params:
         runs=TRAININGS,
+        layout=study.figure.model_dump(),
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,

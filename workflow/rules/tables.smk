@@ -16,7 +16,6 @@ rule tables:
         table1_tex=report(
             f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"
         ),
-        supplement_tex=f"{RESULTS}/supplement.tex",
     log:
         f"{RESULTS}/logs/tables.log",
     params:

@@ -16,7 +16,7 @@ with job("claims", snakemake.log[0]):
 
     params, found, output = snakemake.params, snakemake.input, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    table = read_metrics(found.metrics, [tuple(run[:3]) for run in params.runs], settings)
+    table = read_metrics(found.metrics, params.runs, settings)
     table = table.merge(read_table(found.betas, BETAS), how="left", validate="1:1")
     claims = ledger(table, settings)
     hours = sum(read_record(Path(path))["seconds"] for path in found.records) / 3600

@@ -18,6 +18,6 @@ with job(f"Figure {number}", snakemake.log[0]):
     write_atomically(output.single_seeds, single_seeds.to_csv(index=False))
     write_atomically(output.curves, curves.to_csv(index=False))
     look = figures.Look(layout, settings.confidence, params.labels, params.colours)
-    figure = figures.draw_figure(curves, single_seeds, shown, *look)
+    figure = figures.draw_figure(curves, single_seeds, shown, look)
     for path in (output.pdf, output.png):
         figures.save_figure(figure, path)

@@ -11,6 +11,5 @@ with job("metrics", snakemake.log[0]):
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
     runs = read_runs(snakemake.input.records, params.runs)
-    wanted = [tuple(run[:3]) for run in params.runs]
     for path, table in ((output.metrics, metrics_table), (output.betas, betas_table)):
-        write_atomically(path, table(runs, wanted, settings).to_csv(index=False))
+        write_atomically(path, table(runs, settings).to_csv(index=False))

@@ -19,7 +19,7 @@ with job(f"the picture {name}", snakemake.log[0]):
     if source.suffix == ".json":
         found = json.loads(source.read_text(encoding="utf-8"))["claims"]
     else:
-        found = read_metrics(source, [tuple(run[:3]) for run in params.runs], settings)
+        found = read_metrics(source, params.runs, settings)
     table = PICTURES[name].data(found, settings)
     write_atomically(output.data, table.to_csv(index=False))
     look = Look(layout, settings.confidence, params.labels, params.colours)

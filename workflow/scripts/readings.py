@@ -1,14 +1,12 @@
-"""What decides the ranking: every reading of Table 1's metrics, as data, table and picture."""
+"""What decides the ranking: every reading of Table 1's metrics, as data and picture."""
 
 from job import job
 
 with job("readings", snakemake.log[0]):
-    from mace_rl.config.results import MetricsConfig
+    from mace_rl.config.results import FigureConfig, MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results import tables
-    from mace_rl.results.figures import save_figure
+    from mace_rl.results.figures import Look, save_figure
     from mace_rl.results.readings import draw_readings, readings
-    from mace_rl.results.renderings import markdown
     from mace_rl.runs.finished import read_runs
 
     params, output = snakemake.params, snakemake.output
@@ -16,7 +14,8 @@ with job("readings", snakemake.log[0]):
     frames = read_runs(snakemake.input.records, params.runs)
     table = readings(frames, settings)
     write_atomically(output.table, table.to_csv(index=False))
-    write_atomically(output.markdown, markdown(tables.readings(table, settings)))
-    figure = draw_readings(table, params.labels, params.colours, settings)
+    layout = FigureConfig.model_validate(params.layout)
+    look = Look(layout, settings.confidence, params.labels, params.colours)
+    figure = draw_readings(table, settings, look)
     for path in (output.png, output.pdf):
         save_figure(figure, path)

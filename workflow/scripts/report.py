@@ -6,19 +6,20 @@ from job import job
 
 with job("the report", snakemake.log[0]):
     from mace_rl.config.agent import PPOConfig
-    from mace_rl.config.results import MetricsConfig
+    from mace_rl.config.results import FigureConfig, MetricsConfig
     from mace_rl.files import write_atomically
     from mace_rl.report.animations import animations
-    from mace_rl.report.page import Making, page, read_data
+    from mace_rl.report.page import Making, page
+    from mace_rl.results.figures import Look
+    from mace_rl.results.pages import read_data
     from mace_rl.runs.provenance import read_record
 
     params, records = snakemake.params, [Path(record) for record in snakemake.input.records]
     settings = MetricsConfig.model_validate(params.settings)
-    runs = [tuple(run[:3]) for run in params.runs]
     found = {name: path for name, path in snakemake.input.items() if isinstance(path, str)}
-    data, claims = read_data(found, runs, settings)
+    data, claims = read_data(found, params.runs, settings)
     first = {}  # of the seeds of an environment and variant
-    for (env, variant, _), record in zip(runs, records, strict=True):
+    for (env, variant, *_), record in zip(params.runs, records, strict=True):
         first.setdefault((env, variant), record.parent)
     making = Making(
         command=params.command,
@@ -27,5 +28,6 @@ with job("the report", snakemake.log[0]):
         records=list(map(read_record, records)),
     )
     films = animations(first, params.labels, Path(snakemake.output[0]).parent)
-    html = page(data, claims, making, films, settings, params.labels, params.colours)
+    look = Look(FigureConfig(columns=3), settings.confidence, params.labels, params.colours)
+    html = page(data, claims, making, films, settings, look)
     write_atomically(snakemake.output[0], html)

@@ -5,25 +5,24 @@ from job import job
 with job("tables", snakemake.log[0]):
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results import latex, summary
+    from mace_rl.results import summary
     from mace_rl.results.aggregate import aggregate
     from mace_rl.results.comparisons import comparisons, regret
+    from mace_rl.results.latex import table1_latex
     from mace_rl.results.metrics_table import read_metrics
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)
-    metrics = read_metrics(snakemake.input[0], [tuple(run[:3]) for run in params.runs], settings)
+    metrics = read_metrics(snakemake.input[0], params.runs, settings)
+    means = summary.summary(metrics, settings)
     made = {
-        name: make(metrics, settings)
-        for name, make in (
-            ("table1", summary.table1),
-            ("supplement", summary.supplement),
-            ("comparisons", comparisons),
-            ("aggregate", aggregate),
-            *((("regret", regret),) if settings.regret else ()),
-        )
+        "table1": summary.table1(means),
+        "supplement": summary.supplement(means),
+        "comparisons": comparisons(metrics, settings),
+        "aggregate": aggregate(metrics, settings),
     }
+    if settings.regret:
+        made["regret"] = regret(metrics, settings)
     for name, table in made.items():
         write_atomically(output[name], table.to_csv(index=False))
-    for name, fragment in (("table1", latex.table1_latex), ("supplement", latex.supplement_latex)):
-        write_atomically(output[f"{name}_tex"], fragment(made[name], params.labels, settings))
+    write_atomically(output.table1_tex, table1_latex(made["table1"], params.labels, settings))

@@ -3,25 +3,13 @@
 from job import job
 
 with job("the page of tables", snakemake.log[0]):
-    import json
-    from pathlib import Path
-
-    import pandas as pd
-
     from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.metrics_table import BETAS, read_metrics
-    from mace_rl.results.pages import tables_page
-    from mace_rl.results.records import read_table
+    from mace_rl.results.pages import read_data, tables_page
 
-    params, found = snakemake.params, dict(snakemake.input.items())
+    params = snakemake.params
     settings = MetricsConfig.model_validate(params.settings)
-    claims = found.pop("claims", None)
-    data = {name: pd.read_csv(path) for name, path in found.items()}
-    runs = [tuple(run[:3]) for run in params.runs]
-    data["metrics"] = read_metrics(found["metrics"], runs, settings)
-    data["betas"] = read_table(found["betas"], BETAS)
-    ledger = json.loads(Path(claims).read_text(encoding="utf-8"))["claims"] if claims else None
-    origin = f"`{params.command}`: {len(runs)} runs."
-    page = tables_page(data, ledger, params.pictures, settings, origin)
+    data, claims = read_data(dict(snakemake.input.items()), params.runs, settings)
+    origin = f"`{params.command}`: {len(params.runs)} runs."
+    page = tables_page(data, claims, params.pictures, settings, origin)
     write_atomically(snakemake.output[0], page)

@@ -3,7 +3,7 @@
 import base64
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from mace_rl import files
@@ -24,46 +24,31 @@ class Animation:
     trained: bool
 
 
-@dataclass
-class Animations:
-    """What there is to show of each environment, and why there is not more."""
-
-    shown: dict[str, list[Animation]] = field(default_factory=dict)
-    missing: list[str] = field(default_factory=list)  # sentences
-
-
 def animations(
     runs: Mapping[tuple[str, str], Path], labels: Mapping[str, str], origin: Path
-) -> Animations:
-    """Films of one run of each environment and variant, untrained and trained.
+) -> tuple[dict[str, list[Animation]], list[str]]:
+    """Films of one run of each environment and variant, and sentences on what there is not.
 
     `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
     agents do the same share that film. An agent that is not there and an environment that cannot be
     drawn are said; an agent that is not the one of its `run.json` is an error.
     """
-    found, without = Animations(), []
-    for folder in runs.values():
-        if not (folder / files.AGENT).exists():
-            without.append(str(folder.relative_to(origin)))
+    missing = []
+    without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]
     if without:
-        names = ", ".join(without)
-        found.missing.append(
-            f"Not shown, because {files.AGENT} is not there, are the agents of {names}."
-        )
-    for environment in dict.fromkeys(environment for environment, _ in runs):
-        folders = {
-            variant: folder
-            for (env, variant), folder in runs.items()
-            if env == environment and (folder / files.AGENT).exists()
-        }
+        names = ", ".join(str(folder.relative_to(origin)) for folder in without)
+        missing.append(f"Not shown, because {files.AGENT} is not there, are the agents of {names}.")
+    folders: dict[str, dict[str, Path]] = {}
+    for (environment, variant), folder in runs.items():
+        if folder not in without:
+            folders.setdefault(environment, {})[variant] = folder
+    shown = {}
+    for environment, of_variants in folders.items():
         try:
-            shown = _of_one(folders, labels)
+            shown[environment] = _of_one(of_variants, labels)
         except RenderError as error:
-            found.missing.append(f"{error}.")
-            continue
-        if shown:
-            found.shown[environment] = shown
-    return found
+            missing.append(f"{error}.")
+    return shown, missing
 
 
 def _of_one(folders: Mapping[str, Path], labels: Mapping[str, str]) -> list[Animation]:

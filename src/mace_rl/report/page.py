@@ -4,7 +4,6 @@ One file that needs nothing else: pictures and styles stand in it, there is no s
 content security policy has the browser refuse whatever would be loaded.
 """
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,25 +17,21 @@ from matplotlib.colors import to_hex
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.results import FigureConfig, MetricsConfig
-from mace_rl.report.animations import Animations
+from mace_rl.report.animations import Animation
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
-from mace_rl.results import tables
+from mace_rl.results import pages, tables
 from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICTS
 from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
-from mace_rl.results.metrics_table import read_metrics
-from mace_rl.results.paper import has_all
+from mace_rl.results.pages import Data, Ledger
 from mace_rl.results.pictures import PICTURES
 from mace_rl.results.readings import draw_readings
-from mace_rl.results.records import RunKey
 from mace_rl.results.renderings import as_html, number
 from mace_rl.results.summary import from_to
 
 TEMPLATE = Path(__file__).with_name("page.html")
 FIGURES = ("1", "2")
 MINUTE, HOUR = 60, 3600
-Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
-Ledger = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -49,24 +44,13 @@ class Making:
     records: Sequence[Mapping[str, Any]]  # the `run.json` of every run
 
 
-def read_data(
-    found: Mapping[str, Any], runs: Sequence[RunKey], settings: MetricsConfig
-) -> tuple[dict[str, pd.DataFrame], Ledger]:
-    """The data of these runs, and the ledger, empty without one, from files by their names."""
-    data = {name: pd.read_csv(path) for name, path in found.items() if str(path).endswith(".csv")}
-    data["metrics"] = read_metrics(found["metrics"], runs, settings)
-    path = found.get("claims")
-    return data, json.loads(Path(path).read_text(encoding="utf-8"))["claims"] if path else ()
-
-
 def page(
     data: Data,
     claims: Ledger,
     making: Making,
-    animations: Animations,
+    animations: tuple[Mapping[str, Sequence[Animation]], Sequence[str]],
     settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> str:
     """The page as HTML; equal arguments give an equal page."""
     environment = jinja2.Environment(
@@ -78,15 +62,11 @@ def page(
     )
     environment.filters |= {"short": short, "duration": duration, "table": as_html}
     metrics, records = data["metrics"], making.records
-    environments = list(metrics["env"].unique())
-    counts = {how: Counter(claim[how]["verdict"] for claim in claims) for how in (LITERAL, ROBUST)}
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
-        counts=counts,
-        no_common_bar=has_all(metrics["env"], labels) and not settings.reference_return,
+        counted=pages.counted,
         ways=(LITERAL, ROBUST),
         verdicts=VERDICTS,
-        few=_too_few(claims, environments),
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),
@@ -95,16 +75,17 @@ def page(
         interruptions=sum(len(record["interruptions"]) for record in records),
         confidence=f"{100 * settings.confidence:g} %",
         window=settings.moving_average,
-        environments=environments,
-        labels=labels,
-        colours={variant: to_hex(colour) for variant, colour in colours.items()},
+        environments=list(metrics["env"].unique()),
+        labels=look.labels,
+        colours={variant: to_hex(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
-        figures=_figures(data, settings, labels, colours),
+        figures={figure: _panels(data, figure, settings, look) for figure in FIGURES},
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
-        animations=animations,
-        pictures=_pictures(data, claims, settings, labels, colours),
-        tables=_tables(data, making, settings, labels),
-        parts=lambda claim, how: _parts(claim, how, settings, labels),
+        shown=animations[0],
+        missing=animations[1],
+        pictures=_pictures(data, claims, settings, look),
+        tables=_tables(data, making, settings, look.labels),
+        parts=lambda claim, how: _parts(claim, how, settings, look.labels),
         making=making,
         origins=_origins(records),
     )
@@ -124,46 +105,27 @@ def duration(seconds: float) -> str:
     return f"{number(seconds, 1)} s"
 
 
-def _too_few(claims: Ledger, environments: Sequence[str]) -> list[str]:
-    """Those of the environments in which a claim's part has fewer seeds than the rule asks for."""
-    parts = [part for claim in claims for part in claim[ROBUST]["parts"]]
-    few = {env for part in parts if part["seeds"] < FEWEST_SEEDS for env in part["environments"]}
-    return [environment for environment in environments if environment in few]
-
-
-def _figures(
-    data: Data, settings: MetricsConfig, labels: Mapping[str, str], colours: Mapping[str, str]
-) -> dict[str, dict[str, str]]:
-    """Figures 1 and 2, panel by panel."""
-    return {
-        figure: panels(
-            data[f"figure{figure}"],
-            data[f"figure{figure}_seeds"],
-            quantity(figure, settings),
-            settings,
-            labels,
-            colours,
-        )
-        for figure in FIGURES
-    }
+def _panels(data: Data, figure: str, settings: MetricsConfig, look: Look) -> dict[str, str]:
+    """Figure 1 or 2, panel by panel."""
+    curves, seeds = data[f"figure{figure}"], data[f"figure{figure}_seeds"]
+    return panels(curves, seeds, quantity(figure, settings), look)
 
 
 def _pictures(
     data: Data,
     claims: Ledger,
     settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> dict[str, str]:
     """Those that are wider than a phone, as SVG by name; those that this study has data for."""
-    look = Look(FigureConfig(columns=3), settings.confidence, labels, colours)
+    look = look._replace(layout=FigureConfig(columns=3))
     made_of = {
         "every_seed": data["metrics"],
         "constants": data["metrics"] if settings.regret else None,
         "solved": data["metrics"] if settings.solved_return else None,
         "forest": claims or None,
     }
-    drawn = {"readings": draw_readings(data["readings"], labels, colours, settings)}
+    drawn = {"readings": draw_readings(data["readings"], settings, look)}
     for name, found in made_of.items():
         if found is not None:
             drawn[name] = PICTURES[name].draw(PICTURES[name].data(found, settings), look)

@@ -2,13 +2,12 @@
 
 import math
 import re
-from collections.abc import Mapping
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mace_rl.config.results import FigureConfig, MetricsConfig
-from mace_rl.results.figures import Quantity, draw_figure, figure_as_svg
+from mace_rl.config.results import FigureConfig
+from mace_rl.results.figures import Look, Quantity, draw_figure, figure_as_svg
 
 WIDTH, HEIGHT = 3.3, 2.5  # inches: letters of a readable size on a phone
 # What figures draw in black (seaborn: almost), light grey and white, in light and in dark.
@@ -21,9 +20,7 @@ def panels(
     curves: pd.DataFrame,
     single_seeds: pd.DataFrame,
     shown: Quantity,
-    settings: MetricsConfig,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> dict[str, str]:
     """The panel of each environment, as `draw_figure` draws it from the same data.
 
@@ -32,15 +29,8 @@ def panels(
     drawn: dict[str, str] = {}
     for environment, own in curves.groupby("env", sort=False):
         seeds = single_seeds[single_seeds["env"] == environment]
-        figure = draw_figure(
-            _thinned(own),
-            _thinned(seeds),
-            shown,
-            FigureConfig(columns=1),
-            settings.confidence,
-            labels,
-            colours,
-        )
+        alone = look._replace(layout=FigureConfig(columns=1))
+        figure = draw_figure(_thinned(own), _thinned(seeds), shown, alone)
         for legend in figure.legends:
             legend.remove()
         figure.set_size_inches(WIDTH, HEIGHT)

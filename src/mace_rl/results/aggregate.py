@@ -4,8 +4,6 @@ The score of a run is (A - r₀) / (A* - r₀), where A is its final return or i
 of training, r₀ the random policy's and A* the best run's of the study in that environment.
 """
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 import pandas as pd
 import scipy
@@ -30,56 +28,36 @@ def scores(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the middle half of the last axis; [..., n] → [...]."""
-    return scipy.stats.trim_mean(values, 0.25, axis=-1)
-
-
-def score_interval(
-    strata: Sequence[np.ndarray],
-    estimate: Callable[[np.ndarray], np.ndarray],
-    confidence: float,
-    repetitions: int,
-    generator: np.random.Generator,
-) -> tuple[float, float]:
-    """Interval of an `estimate` over all runs, whose seeds are resampled within strata [seeds].
-
-    NaN if a stratum has one seed only.
-    """
-    drawn = [
-        values[generator.integers(len(values), size=(repetitions, len(values)))]
-        for values in strata
-    ]
-    smallest = min(len(values) for values in strata)
-    low, high = percentiles(estimate(np.concatenate(drawn, axis=1)), confidence, smallest)
-    return float(low), float(high)
+def interquartile_mean(values: np.ndarray, axis: int) -> np.ndarray:
+    """Mean of the middle half."""
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of aggregate.csv: of each metric and variant the mean and interquartile mean score.
 
-    Columns: metric, variant, runs, then for mean and iqm the estimate and its interval. Every
-    environment weighs as much as it has runs.
+    Columns: metric, variant, runs, then for mean and iqm the estimate and its interval, NaN if an
+    environment has one seed. Every environment weighs as much as it has runs.
     """
-    rows = []
+    rows, repetitions = [], settings.bootstrap_repetitions
     for (metric, variant), runs in scores(table, settings).groupby(
         ["metric", "variant"], sort=False
     ):
         strata = [group["score"].to_numpy() for _, group in runs.groupby("env", sort=False)]
+        smallest = min(len(values) for values in strata)
+        generator = np.random.default_rng(settings.bootstrap_seed)
+        drawn = np.concatenate(  # the seeds of each environment resampled, [repetitions, runs]
+            [
+                values[generator.integers(len(values), size=(repetitions, len(values)))]
+                for values in strata
+            ],
+            axis=1,
+        )
         row = {"metric": metric, "variant": variant, "runs": len(runs)}
-        for name, estimate in (("mean", _mean), ("iqm", interquartile_mean)):
-            low, high = score_interval(
-                strata,
-                estimate,
-                settings.confidence,
-                settings.bootstrap_repetitions,
-                np.random.default_rng(settings.bootstrap_seed),
-            )
-            value = float(estimate(np.concatenate(strata)))
+        for name, estimate in (("mean", np.mean), ("iqm", interquartile_mean)):
+            resampled = estimate(drawn, axis=-1)
+            low, high = percentiles(resampled, settings.confidence, smallest)
+            value = float(estimate(np.concatenate(strata), axis=-1))
             row |= {name: value, f"{name}_low": low, f"{name}_high": high}
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    return np.mean(values, axis=-1)

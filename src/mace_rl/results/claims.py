@@ -7,6 +7,7 @@ when it was written.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,19 +168,19 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]
         ]
         for how in (LITERAL, ROBUST)
     }
-    records = []
-    for how in found:
-        _judge([finding for findings in found[how] for finding in findings])
-    for number, claim in enumerate(CLAIMS):
-        record: dict[str, Any] = {"claim": claim.name, "statement": claim.statement}
-        record["paper"] = _paper(claim)
-        for how, of_claims in found.items():
-            record[how] = {
+    for of_claims in found.values():
+        _judge(list(chain.from_iterable(of_claims)))
+    return [
+        {"claim": claim.name, "statement": claim.statement, "paper": _paper(claim)}
+        | {
+            how: {
                 "verdict": verdict([finding.outcome for finding in of_claims[number]]),
                 "parts": [_record(finding) for finding in of_claims[number]],
             }
-        records.append(record)
-    return records
+            for how, of_claims in found.items()
+        }
+        for number, claim in enumerate(CLAIMS)
+    ]
 
 
 def _record(finding: Finding) -> dict[str, Any]:
@@ -230,16 +231,17 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
         everything, unit = [1.0], "share of everything"
     differences = [x - y for x, y in pairs]
     how = CONFIDENCE, settings.bootstrap_repetitions
-    compared = stratified_comparison(
-        differences, *how, np.random.default_rng(settings.bootstrap_seed)
-    )
-    chance = probability_of_improvement(pairs, *how, np.random.default_rng(settings.bootstrap_seed))
+    seed, columns = settings.bootstrap_seed, [(x[:, None], y[:, None]) for x, y in pairs]
+    compared = stratified_comparison(differences, *how, np.random.default_rng(seed))
+    difference, low, high, p_value = map(float, compared)
+    improved = probability_of_improvement(columns, *how, np.random.default_rng(seed))
+    chance, lowest, highest = (bound.item() for bound in improved)
     return Finding(
         *part,
         unit,
         min(len(difference) for difference in differences),
-        *compared,
-        *chance,
+        *(difference, low, high, p_value),
+        *(chance, lowest, highest),
         _detectable(differences),
         WORTH_MENTIONING * everything[0],
         _in_paper(part, claim) if unit == "episodes" else np.nan,
@@ -257,13 +259,8 @@ def _pair(
     wide = runs.pivot(index="seed", columns="variant", values=part.metric).astype(np.float64)
     if episodes:
         wide = wide.clip(upper=runs["episodes"].min())
-    variant = wide[part.variant].dropna().to_numpy()
-    baseline = np.zeros_like(variant)
-    if part.baseline is not None:
-        both = wide[[part.variant, part.baseline]].dropna(how="all")
-        if both.isna().any(axis=None):
-            raise ValueError(f"{part.variant} and {part.baseline} do not have the same seeds")
-        variant, baseline = both.to_numpy().T
+    variant = wide[part.variant].to_numpy()
+    baseline = wide[part.baseline].to_numpy() if part.baseline else np.zeros_like(variant)
     return (-variant, -baseline) if episodes else (variant, baseline)
 
 

@@ -13,9 +13,9 @@ from mace_rl.results.statistics import (
     draws,
     holm,
     logrank,
-    paired_comparisons,
+    paired_comparison,
     percentiles,
-    probabilities_of_improvement,
+    probability_of_improvement,
 )
 
 ALL = "all"  # in the place of an environment: the mean over all of them
@@ -102,26 +102,28 @@ def _compare(
         x, y = (_reached(own, metrics, budget) for own in both)
         reached.append((x, y))
         restricted.append((np.where(np.isinf(x), budget, x), np.where(np.isinf(y), budget, y)))
-    better = probabilities_of_improvement(
+    better = probability_of_improvement(
         [(x * signs, y * signs) for x, y in restricted], *how, np.random.default_rng(seed)
     )
     censored = sum(np.isinf(values).sum(axis=0) for both in reached for values in both)
     seeds = min(len(x) for x, _ in reached)
     rows = [
         Comparison(ALL, metric.name, variant, baseline, seeds, int(never), *UNTESTED, np.nan, *one)
-        for metric, never, one in zip(metrics, censored, better, strict=True)
+        for metric, never, *one in zip(metrics, censored, *better, strict=True)
     ]
     if len(environments) > 1:
         return rows
     [environment], [(x, y)], [events] = environments, restricted, reached
-    compared = paired_comparisons(x, y, *how, np.random.default_rng(seed))
-    for place, (metric, found) in enumerate(zip(metrics, compared, strict=True)):
+    compared = paired_comparison(x - y, *how, np.random.default_rng(seed))
+    for place, (metric, *found) in enumerate(zip(metrics, *compared, strict=True)):
         test = "sign-flip"
         if metric.unit == "episodes":
             mine, theirs = (values[:, place] for values in events)
-            p_value = logrank(mine, theirs, how[1], np.random.default_rng(seed))
-            test, found = "log-rank", found._replace(p_value=p_value)
-        rows[place] = rows[place]._replace(env=environment, test=test, **found._asdict())
+            test, found[-1] = "log-rank", logrank(mine, theirs, how[1], np.random.default_rng(seed))
+        difference, low, high, p_value = found
+        rows[place] = rows[place]._replace(
+            env=environment, difference=difference, low=low, high=high, test=test, p_value=p_value
+        )
     return rows
 
 

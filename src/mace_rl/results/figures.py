@@ -17,7 +17,7 @@ import numpy as np
 from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.results.metrics import moving_average
 from mace_rl.results.records import RecordError, RunKey
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import interval
 
 if TYPE_CHECKING:  # imported where they are used: planning the workflow does without
     import pandas as pd
@@ -112,15 +112,10 @@ def mean_curves(
         values = wide.to_numpy().T  # [seeds, episodes]
         if np.isnan(values).any():
             raise RecordError(f"the seeds of {environment}, {variant} differ in their episodes")
-        interval = mean_interval(
-            values,
-            settings.confidence,
-            settings.bootstrap_repetitions,
-            np.random.default_rng(settings.bootstrap_seed),
-        )
+        ends = interval(values, settings)
         if shown.limits is not None:  # where the mean lies, the ends of its interval do
-            interval = np.clip(interval, *shown.limits)
-        row = (environment, variant, wide.index, values.mean(axis=0), *interval, len(values))
+            ends = np.clip(ends, *shown.limits)
+        row = (environment, variant, wide.index, values.mean(axis=0), *ends, len(values))
         curves.append(pd.DataFrame(dict(zip(columns, row, strict=True))))
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
 
@@ -129,21 +124,18 @@ def draw_figure(
     curves: "pd.DataFrame",
     single_seeds: "pd.DataFrame",
     shown: Quantity,
-    layout: FigureConfig,
-    confidence: float,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
+    look: Look,
 ) -> "Figure":
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
     The mean over seeds is a line, its interval a band (from three seeds on), and the single seeds
     are faint lines behind. Where most is learned at the beginning, an inset shows that. Where there
-    is nothing to show, the figure says so. What follows `shown` is a `Look`.
+    is nothing to show, the figure says so.
     """
     environments = list(curves["env"].unique())
     with style():
         names = ("Training episodes", shown.label) if environments else ("", "")
-        figure, panels = grid(max(len(environments), 1), layout.columns, *names)
+        figure, panels = grid(max(len(environments), 1), look.layout.columns, *names)
         if not environments:
             panels[0].text(0.5, 0.5, f"{shown.label} is 0 in every run", ha="center", va="center")
             panels[0].set_axis_off()
@@ -157,17 +149,17 @@ def draw_figure(
             axes.set_xlim(0, own["episode"].max())
             axes.locator_params(nbins=4)
             axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))
-            _draw(axes, own, labels, colours)
+            _draw(axes, own, look)
             seeds = own.groupby("variant")["n"].max()
             for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
-                faint: dict[str, Any] = {"color": colours[variant], "linewidth": 0.5}
+                faint: dict[str, Any] = {"color": look.colours[variant], "linewidth": 0.5}
                 faint |= {"alpha": 0.6 / math.sqrt(seeds[variant]), "zorder": 1}
                 if seeds[variant] > 1:  # else its line is the mean's
                     axes.plot(run["episode"], run[shown.name], **faint)
-            share = layout.inset
+            share = look.layout.inset
             if share and shown.limits is None and _is_early(own, share):
                 inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
-                _draw(inset, own[own["episode"] <= share * own["episode"].max()], labels, colours)
+                _draw(inset, own[own["episode"] <= share * own["episode"].max()], look)
                 inset.set_xlim(0, share * own["episode"].max())
                 inset.locator_params(nbins=3)
                 inset.tick_params(labelsize="x-small")
@@ -175,10 +167,10 @@ def draw_figure(
         explained = "One seed."
         if most > 1:
             count = f"{most}" if fewest == most else f"{fewest} to {most}"
-            band = f" Band: its {100 * confidence:g} % interval." if most >= BAND_SEEDS else ""
+            band = f" Band: its {100 * look.confidence:g} % interval." if most >= BAND_SEEDS else ""
             explained = f"Line: mean over {count} seeds.{band} Faint lines: single seeds."
-        if layout.inset and any(axes.child_axes for axes in panels):
-            explained += f" Inset: the first {100 * layout.inset:g} %."
+        if look.layout.inset and any(axes.child_axes for axes in panels):
+            explained += f" Inset: the first {100 * look.layout.inset:g} %."
         legend(figure, explained)
     return figure
 
@@ -270,15 +262,13 @@ def _is_early(curves: "pd.DataFrame", share: float) -> bool:
     return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
 
 
-def _draw(
-    axes: "Axes", curves: "pd.DataFrame", labels: Mapping[str, str], colours: Mapping[str, str]
-) -> None:
+def _draw(axes: "Axes", curves: "pd.DataFrame", look: Look) -> None:
     """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
     drawn: list[np.ndarray] = []
     near = HIDDEN * np.ptp(curves["mean"])
     for name, curve in curves.groupby("variant", sort=False):
         variant, episodes, mean = str(name), curve["episode"], curve["mean"].to_numpy()
-        colour = colours[variant]
+        colour = look.colours[variant]
         if curve["n"].max() >= BAND_SEEDS:
             band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
             axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
@@ -289,6 +279,6 @@ def _draw(
             color=colour,
             linestyle=(0, (4, 4 * covered)) if covered else "-",
             linewidth=1.3,
-            label=labels[variant],
+            label=look.labels[variant],
             zorder=3,
         )

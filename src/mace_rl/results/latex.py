@@ -1,4 +1,4 @@
-"""The paper's Table 1 and Table 2, and the supplement, as LaTeX to \\input."""
+"""The paper's Table 1 and Table 2 as LaTeX to \\input."""
 
 from collections.abc import Mapping
 
@@ -21,18 +21,6 @@ def table1_latex(table: pd.DataFrame, labels: Mapping[str, str], settings: Metri
         " Lower is better for both; the lowest mean is \\textbf{bold}. "
     ) + _how(table, settings.confidence)
     return latex_float(caption, "tab:table1", tables.table1(tables.named(table, labels)))
-
-
-def supplement_latex(
-    table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig
-) -> str:
-    """The companion metrics from `summary.supplement`: a table per environment."""
-    floats = []
-    for environment, frame in tables.companions(tables.named(table, labels), settings).items():
-        how = _how(table[table["env"] == environment], settings.confidence)
-        caption = f"{escaped(environment)}, the companion metrics. {how}"
-        floats.append(latex_float(caption, f"tab:supplement:{environment}", frame))
-    return "\n".join(floats)
 
 
 def table2_latex(ppo: Mapping[str, PPOConfig]) -> str:

@@ -1,8 +1,8 @@
 """metrics.csv: a row of `mace_rl.results.metrics` for each run, made from records or read back."""
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from numbers import Real
 from pathlib import Path
 
@@ -48,35 +48,28 @@ def metrics_of_run(
             row[metric.name] = float(value)
         else:
             kind = "an Episode" if metric.unit == "episodes" else "a finite number"
-            raise ConfigError(f"{metric.name} of {_name(run)} is {value!r}, but should be {kind}")
+            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
     return {name: row[name] for name in metrics_columns(metrics)}
 
 
-def metrics_table(
-    runs: Mapping[RunKey, pd.DataFrame], wanted: Sequence[RunKey], settings: MetricsConfig
-) -> pd.DataFrame:
-    """One row of `metrics_columns` per run, in the order of `wanted`.
+def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
+    """One row of `metrics_columns` per run, in the order of `runs`.
 
-    Raises `RecordError` unless `runs` holds exactly these, and `ConfigError` for metrics that
-    cannot be.
+    Raises `ConfigError` and `RecordError` for metrics that cannot be.
     """
-    _check_runs("the records", runs, wanted)
-    table = pd.DataFrame([metrics_of_run(runs[run], run, settings) for run in wanted])
+    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
     _check_attained("the table of metrics", table, all_metrics(settings))
-    _check_budgets("the records", table)
     return table
 
 
-def betas_table(
-    runs: Mapping[RunKey, pd.DataFrame], wanted: Sequence[RunKey], settings: MetricsConfig
-) -> pd.DataFrame:
+def betas_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
     """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation.
 
     The end is that of `final_return`; the last column is what `stagnation_correlation` says.
     """
     rows = []
-    for run in wanted:
-        returns, beta = (runs[run][name].to_numpy() for name in ("extrinsic_return", "beta"))
+    for run, frame in runs.items():
+        returns, beta = (frame[name].to_numpy() for name in ("extrinsic_return", "beta"))
         end = final_return(beta, settings.final_fraction)
         correlation = stagnation_correlation(returns, beta, settings.moving_average)
         rows.append([*run, end, beta.min(), beta.max(), correlation])
@@ -84,43 +77,20 @@ def betas_table(
 
 
 def read_metrics(
-    path: str | Path, wanted: Sequence[RunKey], settings: MetricsConfig
+    path: str | Path, runs: Sequence[Sequence[str | int]], settings: MetricsConfig
 ) -> pd.DataFrame:
-    """Read metrics.csv; `RecordError` unless it is `metrics_table` of exactly the `wanted` runs."""
+    """Read metrics.csv; `RecordError` unless it has a possible row for each of `runs`, in order.
+
+    runs: of each its environment, variant, seed and number of episodes.
+    """
     metrics = all_metrics(settings)
     table = read_table(path, metrics_columns(metrics))
-    found = list(zip(table["env"], table["variant"], table["seed"].tolist(), strict=True))
-    _check_runs(str(path), found, wanted)
-    for line, (run, right) in enumerate(zip(found, wanted, strict=True), start=2):
+    found = table[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
+    for line, (run, right) in enumerate(zip_longest(found, map(tuple, runs)), start=2):
         if run != right:
-            raise RecordError(
-                f"{path}: line {line}: {_name(run)} stands where {_name(right)} belongs"
-            )
+            raise RecordError(f"{path}: line {line}: the run {run} stands where {right} belongs")
     _check_attained(str(path), table, metrics)
-    _check_budgets(str(path), table)
     return table
-
-
-def _check_runs(origin: str, found: Iterable[RunKey], wanted: Sequence[RunKey]) -> None:
-    """Refuse a set of runs that is not exactly the configured one."""
-    counts = Counter(iter(found))
-    for run in wanted:
-        if counts[run] != 1:
-            problem = "stands more than once in" if counts[run] else "is missing from"
-            raise RecordError(f"{_name(run)} {problem} {origin}")
-    for run in counts.keys() - set(wanted):
-        raise RecordError(f"{_name(run)} in {origin} is not in the configuration")
-
-
-def _check_budgets(origin: str, table: pd.DataFrame) -> None:
-    """Refuse seeds of different lengths, which must not be averaged."""
-    for (environment, variant), group in table.groupby(["env", "variant"], sort=False):
-        if group["episodes"].nunique() != 1:
-            counts = sorted(set(group["episodes"]))
-            raise RecordError(
-                f"{origin}: the seeds of {environment}, {variant} have different numbers of"
-                f" episodes: {counts}"
-            )
 
 
 def _check_attained(origin: str, table: pd.DataFrame, metrics: Sequence[Metric]) -> None:
@@ -134,8 +104,3 @@ def _check_attained(origin: str, table: pd.DataFrame, metrics: Sequence[Metric])
                 f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
                 f" {last[row]} episodes with {metric.flag} = {flag[row]}"
             )
-
-
-def _name(run: RunKey) -> str:
-    environment, variant, seed = run
-    return f"the run {environment}, {variant}, seed {seed}"

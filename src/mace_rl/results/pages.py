@@ -1,7 +1,9 @@
 """Pages of Markdown: claims.md, the ledger, and tables.md, every table of a study."""
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -10,19 +12,36 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.results import tables
 from mace_rl.results.claims import LITERAL, POWER, ROBUST, VERDICTS
 from mace_rl.results.comparisons import ALL
+from mace_rl.results.metrics_table import BETAS, read_metrics
+from mace_rl.results.records import read_table
 from mace_rl.results.renderings import markdown
 from mace_rl.results.summary import from_to
 
 RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
 
+Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
+Ledger = Sequence[Mapping[str, Any]]  # the records of `claims.ledger`
 
-def claims_page(claims: Sequence[Mapping[str, Any]], origin: str) -> str:
+
+def read_data(
+    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> tuple[dict[str, pd.DataFrame], Ledger]:
+    """The data of these runs, and the ledger, empty without one, from files by their names."""
+    data = {name: pd.read_csv(path) for name, path in found.items() if str(path).endswith(".csv")}
+    data["metrics"] = read_metrics(found["metrics"], runs, settings)
+    if "betas" in found:
+        data["betas"] = read_table(found["betas"], BETAS)
+    path = found.get("claims")
+    return data, json.loads(Path(path).read_text(encoding="utf-8"))["claims"] if path else ()
+
+
+def claims_page(claims: Ledger, origin: str) -> str:
     """claims.md, from the records of `claims.ledger`; `origin` says how it was made."""
     intro = f"# Does it hold?\n\n{origin} The rule of the verdicts: docs/method.md.\n\n"
     return intro + markdown(tables.verdicts(claims)) + "".join(_parts(claims))
 
 
-def _parts(claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _parts(claims: Ledger) -> Iterator[str]:
     for how in (LITERAL, ROBUST):
         yield (
             f"\n## Part by part: {how}\n\n"
@@ -34,15 +53,15 @@ def _parts(claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield markdown(tables.parts(claims, how, {}))
 
 
-def counted(claims: Sequence[Mapping[str, Any]], how: str) -> str:
+def counted(claims: Ledger, how: str) -> str:
     """How many claims have which verdict, in words."""
     counts = Counter(claim[how]["verdict"] for claim in claims)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
 
 
 def tables_page(
-    data: Mapping[str, pd.DataFrame],
-    claims: Sequence[Mapping[str, Any]] | None,
+    data: Data,
+    claims: Ledger,
     pictures: Sequence[str],
     settings: MetricsConfig,
     origin: str,
@@ -70,20 +89,21 @@ def _section(title: str, note: str, frame: pd.DataFrame) -> str:
     return f"\n## {title}\n{lines}\n{markdown(frame)}"
 
 
-def _ledger(claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _ledger(claims: Ledger) -> Iterator[str]:
     verdicts = "; ".join(f"{how}: {counted(claims, how)}" for how in (LITERAL, ROBUST))
     note = f"Of the paper's {len(claims)} claims, {verdicts}. The rule: docs/method.md."
     yield _section("Does it hold?", note, tables.verdicts(claims))
     yield from _parts(claims)
 
 
-def _means(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+def _means(data: Data, settings: MetricsConfig) -> Iterator[str]:
     """What each variant reached in each environment."""
     runs, table1, supplement = data["metrics"], data["table1"], data["supplement"]
     interval = f"{100 * settings.confidence:g} % interval"
+    seeds = from_to(runs.groupby(["env", "variant"]).size())
     for metric, title in RETURNS.items():
         frame = tables.means(supplement, metric, settings)
-        yield _section(title, f"Mean over {_seeds(runs)} seeds ({interval}).", frame)
+        yield _section(title, f"Mean over {seeds} seeds ({interval}).", frame)
     frame = tables.worst(runs, settings)
     yield _section("Final return of the worst seed", "", frame)
     if "solved" in runs:
@@ -97,11 +117,7 @@ def _means(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterato
     yield _section("Table 1", note, tables.table1(table1))
 
 
-def _seeds(runs: pd.DataFrame) -> str:
-    return from_to(runs.groupby(["env", "variant"]).size())
-
-
-def _compared(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+def _compared(data: Data, settings: MetricsConfig) -> Iterator[str]:
     """One variant against another."""
     table = data["comparisons"]
     for metric, title in RETURNS.items() if len(table) else ():
@@ -116,7 +132,7 @@ def _compared(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iter
         yield _section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
 
 
-def _others(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+def _others(data: Data, settings: MetricsConfig) -> Iterator[str]:
     """Regret, all environments together, readings and β."""
     if "regret" in data:
         frame = tables.regret(data["regret"], data["supplement"], settings)
@@ -145,7 +161,7 @@ def _others(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterat
         yield _section("β", note, frame)
 
 
-def _companions(data: Mapping[str, pd.DataFrame], settings: MetricsConfig) -> Iterator[str]:
+def _companions(data: Data, settings: MetricsConfig) -> Iterator[str]:
     """Every metric but Table 1's, environment by environment."""
     note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
     for environment, frame in tables.companions(data["supplement"], settings).items():

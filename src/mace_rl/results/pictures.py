@@ -16,7 +16,7 @@ from mace_rl.results.claims import CONFIDENCE, LITERAL, ROBUST, WORTH_MENTIONING
 from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
 from mace_rl.results.metrics import METRICS
 from mace_rl.results.paper import FIXED, FULL, PPO
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import interval
 from mace_rl.results.tables import SOLVED
 
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
@@ -77,12 +77,7 @@ def constants(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     for environment in runs["env"].unique():
         for variant, role in roles.items():
             values = areas[environment, variant].to_numpy()
-            low, high = mean_interval(
-                values,
-                settings.confidence,
-                settings.bootstrap_repetitions,
-                np.random.default_rng(settings.bootstrap_seed),
-            )
+            low, high = interval(values, settings)
             rows.append((environment, variant, role, values.mean(), low, high, len(values)))
     return pd.DataFrame(rows, columns=["env", "variant", "role", "mean", "low", "high", "seeds"])
 
@@ -117,10 +112,8 @@ def draw_constants(table: pd.DataFrame, look: Look) -> "Figure":
             ]
             axes.set_xticks(range(len(fixed)), ticks, rotation=90)
             axes.set_title(str(environment))
-        interval = f"{100 * look.confidence:g} % interval"
-        legend(
-            figure, f"Dot or line: mean over seeds; bar or band: its {interval}. Grey: constants."
-        )
+        level = f"{100 * look.confidence:g} % interval"
+        legend(figure, f"Dot or line: mean over seeds; bar or band: its {level}. Grey: constants.")
     return figure
 
 
@@ -235,8 +228,8 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
         names.set_axis_off()
         for panel in (names, *panels):
             panel.set_ylim(count - 0.5, -0.5)
-        interval = f"{100 * CONFIDENCE:g} % interval"
-        legend(figure, f"Dot: mean over seeds. Bar: its {interval}. Dashed: {UNIT}, the margin.")
+        level = f"{100 * CONFIDENCE:g} % interval"
+        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: {UNIT}, the margin.")
     return figure
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.figures import LEGEND_HEIGHT, WIDTH, style
+from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.metrics_table import metrics_table
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
@@ -58,16 +58,13 @@ def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> 
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
     """
-    wanted, found = list(frames), kinds(settings)
-    runs = {RUNS: metrics_table(frames, wanted, settings)}
-    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), wanted, settings)
-    means = {
-        source: summary(table, [metric for _, metric in found], settings)
-        for source, table in runs.items()
-    }
+    found = kinds(settings)
+    runs = {RUNS: metrics_table(frames, settings)}
+    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), settings)
+    means = {source: summary(table, settings) for source, table in runs.items()}
     parts = []
-    for environment in dict.fromkeys(name for name, _, _ in wanted):
-        parts += [_published(environment, kind, wanted) for kind in PAPER_METRICS]
+    for environment in dict.fromkeys(name for name, _, _ in frames):
+        parts += [_published(environment, kind, list(frames)) for kind in PAPER_METRICS]
         for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
             if source == RUNS or metric.name in ASKED_OF_NOISE:
                 table, own = means[source], runs[source]
@@ -149,29 +146,21 @@ def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
     return ordered, bool(sure)
 
 
-def draw_readings(
-    table: pd.DataFrame,
-    labels: Mapping[str, str],
-    colours: Mapping[str, str],
-    settings: MetricsConfig,
-) -> "Figure":
+def draw_readings(table: pd.DataFrame, settings: MetricsConfig, look: Look) -> "Figure":
     """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
-    from matplotlib.figure import Figure
-
     environments, lines = list(table["env"].unique()), in_order(table)
     variants = list(table["variant"].unique())
     step = min(0.22, 0.8 / len(variants))  # of a line, from variant to variant
     with style():
-        height = 0.34 * len(lines) + 2 * LEGEND_HEIGHT
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        panels = list(figure.subplots(1, len(environments), sharey=True, squeeze=False).flat)
+        count, height = len(environments), 0.34 * len(lines) + LEGEND_HEIGHT
+        figure, panels = grid(count, count, "Training episodes", height=height)
         for environment, axes in zip(environments, panels, strict=True):
             for place, ((_, _, source), rows) in enumerate(lines):
                 own = rows[rows["env"] == environment].set_index("variant")
                 for name in own.index:
                     row = own.loc[name]
                     shift = step * (variants.index(name) - (len(variants) - 1) / 2)
-                    colour = colours[name]
+                    colour = look.colours[name]
                     axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
                     axes.plot(
                         row["mean"],
@@ -180,26 +169,20 @@ def draw_readings(
                         markersize=3.5,
                         color=colour,
                         markerfacecolor="white" if source == PAPER else colour,
-                        label=labels[name] if place == 1 else None,
+                        label=look.labels[name] if place == 1 else None,
                     )
             for place in range(len(lines) - 1):
                 axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
             axes.set_xlim(left=-0.03 * axes.get_xlim()[1])  # dots at 0 are whole
             axes.locator_params(axis="x", nbins=4)
             axes.set_title(environment)
-            axes.set_xlabel("Training episodes")
         panels[0].set_yticks(
             range(len(lines)), [title(*key, settings) for key, _ in lines], fontsize="small"
         )
         panels[0].invert_yaxis()
-        handles, names = panels[0].get_legend_handles_labels()
-        unique = dict(zip(names, handles, strict=True))
-        figure.legend(
-            unique.values(),
-            unique.keys(),
-            loc="outside lower center",
-            ncols=min(len(unique), 4),
-            title=f"Dot: mean over seeds. Bar: its {100 * settings.confidence:g} % interval. "
-            "Hollow: the paper.",
-        )
+        for axes in panels[1:]:
+            axes.sharey(panels[0])
+            axes.tick_params(labelleft=False)
+        level = f"{100 * look.confidence:g} % interval"
+        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Hollow: the paper.")
     return figure

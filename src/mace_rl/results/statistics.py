@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
 
+from mace_rl.config.results import MetricsConfig
+
 BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
 CHUNK = 2**20  # resampled values held in memory at a time
 BATCH = 1000  # resamples of a test at a time: faster than all 10000, which caches cannot hold
@@ -19,10 +21,10 @@ BATCH = 1000  # resamples of a test at a time: faster than all 10000, which cach
 class PairedComparison(NamedTuple):
     """x - y over the seeds that both have."""
 
-    difference: float  # mean of x - y
-    low: float  # of the interval of the mean difference
-    high: float
-    p_value: float  # two-sided, of the sign-flip test; with n seeds ≥ 2 / 2ⁿ; NaN with one
+    difference: np.ndarray  # mean of x - y, [] or [metrics] as the others
+    low: np.ndarray  # of the interval of the mean difference
+    high: np.ndarray
+    p_value: np.ndarray  # two-sided, of the sign-flip test; with n seeds ≥ 2 / 2ⁿ; NaN with one
 
 
 def interval_kind(seeds: int) -> str:
@@ -55,45 +57,37 @@ def mean_interval(
     return low.reshape(mean.shape), high.reshape(mean.shape)
 
 
+def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, np.ndarray]:
+    """`mean_interval` as configured, from a generator of its own: none depends on another."""
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    return mean_interval(values, settings.confidence, settings.bootstrap_repetitions, generator)
+
+
 def paired_comparison(
-    x: np.ndarray,
-    y: np.ndarray,
+    differences: np.ndarray,
     confidence: float,
     repetitions: int,
     generator: np.random.Generator,
 ) -> PairedComparison:
-    """Compare x with y, [seeds] each, where x[i] and y[i] share seed i.
+    """Compare x with y, of which `differences` are x - y by seed, [seeds] or [seeds, metrics].
 
     The sign-flip test asks whether each sign of x - y was as likely as the other. It is exact while
-    2ⁿ ≤ `repetitions`, else of that many random sign patterns.
+    2ⁿ ≤ `repetitions`, else of that many random sign patterns, the same for all metrics.
     """
-    (compared,) = paired_comparisons(x[:, None], y[:, None], confidence, repetitions, generator)
-    return compared
-
-
-def paired_comparisons(
-    x: np.ndarray,
-    y: np.ndarray,
-    confidence: float,
-    repetitions: int,
-    generator: np.random.Generator,
-) -> list[PairedComparison]:
-    """`paired_comparison` of each column of x and y, [seeds, metrics], with the same draws."""
-    differences = x - y
+    mean = np.mean(differences, axis=0)
     low, high = mean_interval(differences, confidence, repetitions, generator)
-    p_values = np.full(differences.shape[1], np.nan)
-    if len(differences) > 1:
-        p_values = scipy.stats.permutation_test(
-            (differences,),
-            np.mean,
-            permutation_type="samples",
-            n_resamples=repetitions,
-            batch=BATCH,
-            rng=generator,
-            vectorized=True,
-        ).pvalue
-    columns = np.mean(differences, axis=0), low, high, p_values
-    return [PairedComparison(*map(float, row)) for row in zip(*columns, strict=True)]
+    if len(differences) == 1:
+        return PairedComparison(mean, low, high, np.full_like(mean, np.nan))
+    tested = scipy.stats.permutation_test(
+        (differences,),
+        np.mean,
+        permutation_type="samples",
+        n_resamples=repetitions,
+        batch=BATCH,
+        rng=generator,
+        vectorized=True,
+    )
+    return PairedComparison(mean, low, high, tested.pvalue)
 
 
 def stratified_comparison(
@@ -109,26 +103,25 @@ def stratified_comparison(
     With one stratum: `paired_comparison`.
     """
     if len(differences) == 1:
-        zero = np.zeros_like(differences[0])
-        return paired_comparison(differences[0], zero, confidence, repetitions, generator)
+        return paired_comparison(differences[0], confidence, repetitions, generator)
     total = sum(len(values) for values in differences)
     weighted = np.concatenate(  # whose mean is the mean of the strata's means
         [values * total / (len(differences) * len(values)) for values in differences]
     )
-    tested = paired_comparison(weighted, np.zeros(total), confidence, repetitions, generator)
+    tested = paired_comparison(weighted, confidence, repetitions, generator)
     smallest = min(len(values) for values in differences)
     if smallest == 1:
-        return tested._replace(low=np.nan, high=np.nan)
+        return tested._replace(low=np.array(np.nan), high=np.array(np.nan))
     if interval_kind(smallest) == "t":
         errors = [np.var(values, ddof=1) / len(values) for values in differences]
         error = np.sqrt(np.sum(errors)) / len(differences)
-        half = float(scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error)
+        half = scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error
         return tested._replace(low=tested.difference - half, high=tested.difference + half)
     means = [
         draws(len(values), repetitions, generator) @ values / len(values) for values in differences
     ]
     low, high = percentiles(np.mean(means, axis=0), confidence, smallest)
-    return tested._replace(low=float(low), high=float(high))
+    return tested._replace(low=low, high=high)
 
 
 def logrank(
@@ -180,27 +173,12 @@ def probability_of_improvement(
     confidence: float,
     repetitions: int,
     generator: np.random.Generator,
-) -> tuple[float, float, float]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """P(X > Y) + P(X = Y) / 2 for one run of each, and the bounds of its bootstrap interval.
 
-    The mean over `pairs` (x [n], y [m]), one for each environment. All x and y are unpaired and
-    resampled independently. *Greater* is the improvement: pass the negative of a metric of which
-    lower is better.
-    """
-    columns = [(x[:, None], y[:, None]) for x, y in pairs]
-    (found,) = probabilities_of_improvement(columns, confidence, repetitions, generator)
-    return found
-
-
-def probabilities_of_improvement(
-    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
-    confidence: float,
-    repetitions: int,
-    generator: np.random.Generator,
-) -> list[tuple[float, float, float]]:
-    """`probability_of_improvement` of each column of x [n, metrics] and y [m, metrics].
-
-    The same draws serve every metric.
+    Each is [metrics], the mean over `pairs` (x [n, metrics], y [m, metrics]), one for each
+    environment. All x and y are unpaired and resampled independently; the same draws serve every
+    metric. *Greater* is the improvement: pass the negative of a metric of which lower is better.
     """
     metrics = pairs[0][0].shape[1]
     means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
@@ -211,21 +189,17 @@ def probabilities_of_improvement(
         for metric in range(metrics):
             won = np.sum((drawn_x @ wins[:, :, metric]) * drawn_y, axis=1)
             resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
-    low, high = percentiles(
-        resampled, confidence, min(len(runs) for both in pairs for runs in both)
-    )
-    return list(zip(*(bound.tolist() for bound in (means, low, high)), strict=True))
+    fewest = min(len(runs) for both in pairs for runs in both)
+    low, high = percentiles(resampled, confidence, fewest)
+    return means, low, high
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
     """Holm's (1979) adjusted p values, in the given order: reject where one is ≤ the level.
 
     The k-th smallest of m is multiplied by m - k + 1 and is never less than those before it.
-    Raises ValueError for a value outside [0, 1] or NaN.
     """
     p = np.asarray(p_values, dtype=np.float64)
-    if not ((p >= 0) & (p <= 1)).all():
-        raise ValueError(f"p values must be in [0, 1], these are {p.tolist()}")
     order = np.argsort(p)
     adjusted = np.empty_like(p)
     adjusted[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))

@@ -1,25 +1,22 @@
 """Each metric averaged over seeds: the data of table1.csv and supplement.csv."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import Metric, all_metrics
+from mace_rl.results.metrics import all_metrics
 from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import interval
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
 
 
-def summary(
-    table: pd.DataFrame, metrics: Sequence[Metric], settings: MetricsConfig
-) -> pd.DataFrame:
-    """The `metrics` averaged over seeds; `table` is the frame of metrics.csv.
+def summary(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """All metrics averaged over seeds; `table` is the frame of metrics.csv.
 
-    One row per environment, variant and metric, in the order of `table` and `metrics`: `mean`,
+    One row per environment, variant and metric, in the order of `table`: `mean`,
     the bounds `low` and `high` of its interval (NaN with one seed; cut to where its mean must lie,
     [1, E] for a metric in episodes and [0, 1] for a share), the number of `seeds`, how many of them
     are `censored` (counted with E, so the mean is a lower bound), the budget E in `episodes`, and
@@ -29,14 +26,9 @@ def summary(
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
         published = PAPER_TABLE1.get((str(environment), str(variant)), ())
         paper = dict(zip(PAPER_METRICS, published, strict=False))  # empty if it has none
-        for metric in metrics:
+        for metric in all_metrics(settings):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
-            low, high = mean_interval(  # a generator of its own: no cell depends on another
-                values,
-                settings.confidence,
-                settings.bootstrap_repetitions,
-                np.random.default_rng(settings.bootstrap_seed),
-            )
+            low, high = interval(values, settings)
             limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
             low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
             rows.append(
@@ -56,20 +48,14 @@ def summary(
     return pd.DataFrame(rows).astype({"paper": "Int64"})
 
 
-def table1(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """The data of table1.csv: `summary` of the paper's two metrics."""
-    papers = [metric for metric in all_metrics(settings) if metric.name in PAPER_METRICS]
-    return summary(table, papers, settings)
+def table1(means: pd.DataFrame) -> pd.DataFrame:
+    """The data of table1.csv: of a `summary` the paper's two metrics."""
+    return means[means["metric"].isin(PAPER_METRICS)]
 
 
-def supplement(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """`summary` of the other metrics."""
-    return summary(table, companions(settings), settings)
-
-
-def companions(settings: MetricsConfig) -> list[Metric]:
-    """All metrics but the two of Table 1."""
-    return [metric for metric in all_metrics(settings) if metric.name not in PAPER_METRICS]
+def supplement(means: pd.DataFrame) -> pd.DataFrame:
+    """The data of supplement.csv: the other metrics."""
+    return means[~means["metric"].isin(PAPER_METRICS)]
 
 
 def digits_by_metric(table: pd.DataFrame, settings: MetricsConfig) -> dict[tuple[str, str], int]:

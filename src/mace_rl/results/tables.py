@@ -8,7 +8,6 @@ in the data: `named` gives them other names first.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
@@ -18,7 +17,7 @@ from mace_rl.results.metrics import all_metrics
 from mace_rl.results.paper import PAPER_METRICS
 from mace_rl.results.readings import in_order, ranked, title
 from mace_rl.results.renderings import Cell, Value, estimate, number
-from mace_rl.results.statistics import mean_interval
+from mace_rl.results.statistics import interval
 from mace_rl.results.summary import digits_by_metric
 
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
@@ -206,12 +205,7 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
             continue
         found = runs["stagnation_correlation"].to_numpy()
-        low, high = mean_interval(
-            found,
-            settings.confidence,
-            settings.bootstrap_repetitions,
-            np.random.default_rng(settings.bootstrap_seed),
-        )
+        low, high = interval(found, settings)
         seeds = (
             ", ".join(number(beta, 2) for beta in sorted(runs[name]))
             for name in ("beta_end", "beta_lowest")
