@@ -24,13 +24,13 @@ SECTIONS = {
     "acting": "",  # see `instrument`
     "bookkeeping": "",
     "critics' values, advantages": "ppo.advantages_and_returns",
-    "update: actor": "ppo.actor_gradient ppo.optimisers.actor.step",
+    "update: actor": "ppo.improve_policy",
     "update: critics": "ppo.critics.extrinsic.learn",
 }
 BONUS = {
     "update: critics": "ppo.critics.intrinsic.learn",
     "novelty: k-NN": "curiosity.novelty.knn_novelty curiosity.novelty._replace_redundant",
-    "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.observe",
+    "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.refresh",
     "memory": "curiosity.memory.recall curiosity.memory.write",
     "meta network": "controller.next_episode adapt",
 }

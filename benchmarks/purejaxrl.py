@@ -1,11 +1,9 @@
 """PureJaxRL's PPO beside ours and stable-baselines3's, in turn, in the environments it has, too.
 
 PureJaxRL (Apache-2.0) trains in one compiled JAX program, environments included, and wants other
-packages than this project: it has an environment of its own, made of purejaxrl.lock when it is
-first needed. Where these cannot be had, a line says why, here and in measurements.csv. Its own
-code, two files and their licence, is in purejaxrl.tar.xz, made in a clone of `ADDRESS` by
-
-    git archive COMMIT LICENSE purejaxrl/ppo.py purejaxrl/wrappers.py | xz -9e
+packages than this project: it has an environment of its own, made of purejaxrl.lock and a clone of
+its code at `COMMIT` when it is first needed. Where one of these cannot be had, a line says why,
+here and in measurements.csv.
 """
 
 import hashlib
@@ -14,7 +12,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +29,11 @@ ROLLOUTS = {
 }
 LABELS = {name: f"PureJaxRL PPO, {n} × {length}" for name, (n, length, _) in ROLLOUTS.items()}
 
-ADDRESS = "https://github.com/luchris429/purejaxrl"
+ADDRESS = "https://github.com/luchris429/purejaxrl"  # PUREJAXRL names another, such as a folder
 COMMIT = "31756b197773a52db763fdbe6d635e4b46522a73"
-CODE, LOCK = (ROOT / "benchmarks" / f"purejaxrl.{kind}" for kind in ("tar.xz", "lock"))
+LOCK = ROOT / "benchmarks" / "purejaxrl.lock"
 HOME = ROOT / ".venv-purejaxrl"
+CLONE = HOME / "purejaxrl"
 PYTHON = HOME / "bin" / "python"
 
 # One thread, on the processor.
@@ -43,11 +41,12 @@ VARIABLES = dict.fromkeys(THREADS, "1") | {
     "JAX_PLATFORMS": "cpu",
     "NPROC": "1",  # the size of XLA's thread pools
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "GIT_TERMINAL_PROMPT": "0",  # nothing asks for a password
 }
 
 
 class LeftOut(Exception):
-    """Why PureJaxRL's packages cannot be had here, in one line."""
+    """Why PureJaxRL cannot be had here, in one line."""
 
 
 def measure(scale: Scale) -> list[dict[str, Any]]:
@@ -100,25 +99,29 @@ def train(config: dict[str, Any], seed: int) -> dict[str, Any]:
     -I: nothing of this project can be imported there, nor is needed.
     """
     script = str(Path(__file__).with_name("purejaxrl_training.py"))
-    arguments = (str(HOME / "purejaxrl"), json.dumps(config), str(seed))
+    arguments = (str(CLONE / "purejaxrl"), json.dumps(config), str(seed))
     said = carry_out("PureJaxRL's training failed", str(PYTHON), "-I", script, *arguments)
     return json.loads(said.splitlines()[-1])
 
 
 def set_up() -> None:
-    """Make `HOME`, unless it is there, complete, and of this place, lock and code.
+    """Make `HOME`, unless it is there, complete, and of this place, lock and commit.
 
-    `LeftOut` if its packages cannot be had.
+    `LeftOut` if its code or its packages cannot be had.
     """
-    made_of = str(HOME).encode() + LOCK.read_bytes() + CODE.read_bytes()
-    complete = HOME / f"complete-{hashlib.sha256(made_of).hexdigest()[:16]}"
+    made_of = f"{HOME}\n{COMMIT}\n{LOCK.read_text(encoding='utf-8')}"
+    complete = HOME / f"complete-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
     if complete.exists():
         return
     print(f"Setting up {HOME.name} (once: 800 MB) ...", flush=True)
     shutil.rmtree(HOME, ignore_errors=True)
+    source = os.environ.get("PUREJAXRL") or ADDRESS
+    fetching = f"its code cannot be had from {source} (PUREJAXRL can name a clone)"
+    git = ("git", "clone", "--quiet", "--no-checkout", source, str(CLONE))
+    carry_out(fetching, *git, error=LeftOut)
+    checkout = ("git", "-C", str(CLONE), "checkout", "--quiet", "--detach", COMMIT)
+    carry_out(fetching, *checkout, error=LeftOut)
     carry_out("its environment cannot be made", sys.executable, "-m", "venv", str(HOME))
-    with tarfile.open(CODE) as tar:
-        tar.extractall(HOME, filter="data")
     pip = (str(PYTHON), "-m", "pip", "install", "--no-deps", "--only-binary=:all:", "--no-compile")
     failure = "its packages cannot be had"
     carry_out(failure, *pip, "--require-hashes", "-r", str(LOCK), error=LeftOut)
@@ -133,7 +136,7 @@ def carry_out(failure: str, *command: str, error: type[BaseException] = SystemEx
     )
     if done.returncode:
         said = done.stderr.split("\n") if done.stderr.strip() else [f"exit code {done.returncode}"]
-        errors = [line for line in said if line.startswith("ERROR:")]
+        errors = [line for line in said if line.startswith(("fatal:", "ERROR:"))]
         complaint = (errors or [line for line in said if line.strip()])[-1]
         raise error(f"{failure}: {complaint.strip()}")
     return done.stdout

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # More than the 10 updates after which the meta network learns.
 EPISODES = {"Acrobot-v1": 14, "CartPole-v1": 60, "HopperBulletEnv-v0": 60}
 # So small that memory and buffer are full before the end, and what is in them is replaced.
-CHANGES = {"memory": {"capacity": 50}, "novelty": {"buffer_size": 100}}
+CHANGES = {"memory": {"capacity": 50}, "novelty": {"buffer_size": 100, "refresh_every": 32}}
 TABLES = ["table1.csv", "table1.tex", "figure1.pdf", "figure1.png"]  # of the runs in reference/
 
 

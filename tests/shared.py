@@ -18,6 +18,7 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl import cli
 from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork
 from mace_rl.agent.policy import Policy
+from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetworks
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.files import LOCK
@@ -40,10 +41,9 @@ GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes":
 class Twin:
     """A network, or a policy, as its torch module in float64: outputs, gradients by autograd."""
 
-    def __init__(self, owner: Network | Policy) -> None:
-        network = getattr(owner, "network", owner)
-        self.transposed = isinstance(network, CompiledMLP)
-        self.module = copy.deepcopy(network.module()).double()
+    def __init__(self, owner: Network | MetaNetworks | Policy) -> None:
+        self.network = getattr(owner, "network", owner)
+        self.module = copy.deepcopy(self.network.module()).double()
         log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
         self.log_std = torch.nn.Parameter(torch.from_numpy(log_std.astype(np.float64)))
 
@@ -53,8 +53,11 @@ class Twin:
 
     def flat(self, tensors: Iterable[torch.Tensor]) -> np.ndarray:
         """Tensors shaped like `parameters()` as one vector like the network's, or policy's."""
-        arrays = [tensor.detach().numpy() for tensor in tensors]
-        return np.concatenate([(x.T if self.transposed else x).ravel() for x in arrays])
+        return laid_out(self.network, [tensor.detach().numpy() for tensor in tensors])
+
+    def own(self) -> np.ndarray:
+        """Where in the flat vector a parameter is, and not a zero added."""
+        return self.flat(torch.ones_like(part) for part in self.parameters()) == 1
 
     def gradient(self, loss: torch.Tensor) -> np.ndarray:
         """∇ loss by autograd, as one vector."""
@@ -72,6 +75,28 @@ class Twin:
             normal = torch.distributions.Normal(outputs, self.log_std.exp())
             return torch.distributions.Independent(normal, 1)
         return torch.distributions.Categorical(logits=outputs)
+
+
+def laid_out(network: Network | MetaNetworks, arrays: list[np.ndarray]) -> np.ndarray:
+    """Arrays like its module's parameters as one vector like the network's.
+
+    A compiled network has its columns filled up to a multiple of 16 with zeros. What follows the
+    module's parameters, a policy's own, stays as it is.
+    """
+
+    def filled(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, -array.shape[-1] % 16)])
+
+    own, rest = len(list(network.module().parameters())), list(arrays)
+    arrays, rest = rest[:own], rest[own:]
+    if isinstance(network, CompiledMLP):  # each layer's weights with the biases as a last row
+        layers = zip(arrays[::2], arrays[1::2], strict=True)
+        arrays = [filled(np.vstack([weights.T, biases])) for weights, biases in layers]
+    elif isinstance(network, CompiledMetaNetwork):
+        *gates, readout, readout_bias = arrays
+        gates = [filled(part.reshape(*part.shape[:-1], 4, -1)) for part in gates]
+        arrays = [*gates, filled(readout), readout_bias]
+    return np.concatenate([part.ravel() for part in [*arrays, *rest]])
 
 
 def beta_of(twin: Twin, sequence: np.ndarray) -> torch.Tensor:

@@ -140,7 +140,8 @@ def test_units_do_not_matter(run_config, register, monkeypatch, reward, bonus):
         monkeypatch.setattr(Curiosity, "bonus", in_units)
         ppo = {"rollout_steps": 20, "scale_rewards": scaled, "scale_advantages": scaled}
         name = register("Paid-v0", paid, 5)
-        trainer = finish(run_config(name, "mace_fixed", episodes=40, ppo=ppo))
+        novelty = {"refresh_every": 10}
+        trainer = finish(run_config(name, "mace_fixed", episodes=40, ppo=ppo, novelty=novelty))
         assert len(trainer.curiosity.novelty.visited) > 20  # all of novelty was at work
         assert sum(record.extrinsic_return for record in trainer.records) > 40 * reward
         return {name: adam.parameters.tobytes() for name, adam in trainer.ppo.optimisers.items()}

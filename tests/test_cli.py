@@ -202,7 +202,6 @@ def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog)
 OTHERS = {  # what is changed in run.json, and what the message has to name
     "sources": ("", "a finished run of other code, in mace_rl"),
     "versions": ({"numpy": "1.0"}, "a finished run where versions.numpy was '1.0' and is '"),
-    "arithmetic": ({"blas": "Zen"}, "a finished run where arithmetic.blas was 'Zen' and is '"),
 }
 
 

@@ -25,28 +25,29 @@ from mace_rl.train import Trainer
 class SmallProblem:
     """One decision in each of three states: J and its gradient are exact sums over 3 × 2 cases.
 
-    The parameters are in float64, so that finite differences of J are.
+    The parameters are in float64, so that finite differences of J are; the gradient is of what
+    float32 makes of them.
     """
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.actor = Policy(CompiledMLP(mlp([3, 5, 2], 1.0, rng)), Discrete(2), 0.0)
-        self.set(0.7 * rng.standard_normal(len(self.actor.parameters)))
+        own = Twin(self.actor).own()
+        self.parameters = 0.7 * rng.standard_normal(len(own)) * own
         # Reward of each action in each state, for the two kinds.
         self.extrinsic, self.intrinsic = rng.standard_normal((2, 3, 2))
 
-    def set(self, parameters: np.ndarray) -> None:
-        self.parameters = self.actor.network.parameters = parameters
-
     def returns(self, rewards: np.ndarray) -> np.ndarray:
         """What each action in each state adds to the current policy's J, [3, 2]."""
-        logits = self.actor.forward(np.eye(3)).outputs
+        (weights, biases), (out, out_biases) = self.actor.network.layers(self.parameters)
+        logits = np.tanh(weights + biases) @ out + out_biases  # of the unit vectors
         return np.exp(logits) / np.exp(logits).sum(1, keepdims=True) * rewards
 
     def gradient(self, rewards: np.ndarray) -> np.ndarray:
         """∇J through `PPO.policy_gradients`: every case, weighted with its probability."""
         ppo = PPO.__new__(PPO)
         ppo.policy = self.actor
+        self.actor.parameters[:] = self.parameters
         states, actions = np.eye(3).repeat(2, axis=0), np.array([0, 1] * 3)
         (mean,) = ppo.policy_gradients(states, actions, [self.returns(rewards).ravel()])
         return 6 * mean
@@ -67,7 +68,7 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
     moments = {
         "mean": torch.zeros(len(start), dtype=torch.float64),
         "square": torch.from_numpy(usual**2 * (1 - 0.999**500)),
-        "time": 500,
+        "decayed": torch.tensor([0.9**500, 0.999**500], dtype=torch.float64),
     }
 
     def adam(parameters: np.ndarray) -> Adam:
@@ -77,14 +78,13 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
         return optimiser
 
     def next_return(beta: float) -> float:
-        problem.set(start.copy())
+        problem.parameters = start.copy()
         adam(problem.parameters).step(-(extrinsic + beta * intrinsic))
         return problem.returns(problem.extrinsic).sum()
 
     measured = (next_return(beta + 1e-3) - next_return(beta - 1e-3)) / 2e-3
     after = problem.gradient(problem.extrinsic)
-    problem.set(start.copy())
-    direction = adam(problem.parameters).preconditioned(intrinsic)
+    direction = adam(start.copy()).preconditioned(intrinsic)
     # Of a gradient Adam's first moment takes in a tenth, and v̂ hardly anything.
     assert 1e-2 * 0.1 * after @ direction == pytest.approx(measured, rel=0.02, abs=1e-7)
 
@@ -102,11 +102,12 @@ class Watched(Trainer):
     def adapt(self, rollout: list[Experience]) -> float | None:
         meta, adam, learned = Twin(self.controller.network), self.ppo.optimisers["actor"], []
         policy, square, step = adam.parameters.copy(), adam.square.copy(), Adam.step
+        decayed = float(adam.decayed[1])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Adam, "step", lambda s, g: (learned.append(g.copy()), step(s, g))[1])
             credit = super().adapt(rollout)
         directions = [judged.direction.copy() for judged in self.controller.judged[-len(rollout) :]]
-        self.rounds.append(Round(rollout, policy, square, adam.time, meta, directions, learned))
+        self.rounds.append(Round(rollout, policy, square, decayed, meta, directions, learned))
         return credit
 
 
@@ -115,8 +116,8 @@ class Round(NamedTuple):
 
     rollout: list[Experience]
     policy: np.ndarray  # the parameters that played it
-    square: np.ndarray  # of the actor's optimiser, like `time`, before the update
-    time: int
+    square: np.ndarray  # of the actor's optimiser before the update
+    decayed: float  # 0.999 to the power of its steps so far
     meta: Twin  # as it was while it was played
     directions: list[np.ndarray]  # for each of its episodes the change of the update by its β
     learned: list[np.ndarray]  # the gradient, if any, that reached the meta network after it
@@ -125,22 +126,23 @@ class Round(NamedTuple):
 @pytest.fixture(
     scope="module",
     params=[
-        ("CartPole-v1", 1, "compiled"),
-        ("CartPole-v1", 80, "compiled"),
-        ("Pendulum-v1", 400, "compiled"),
-        ("CartPole-v1", 80, "torch"),
+        ("CartPole-v1", 1, "compiled", 3),
+        ("CartPole-v1", 1, "compiled", 1),
+        ("CartPole-v1", 80, "compiled", 4),
+        ("Pendulum-v1", 400, "compiled", 1),
+        ("CartPole-v1", 80, "torch", 4),
     ],
     ids=str,
 )
 def watched(request, run_config) -> Watched:
     """A finished short run; a rollout is one episode, or several."""
-    environment, steps, engine = request.param
+    environment, steps, engine, learn_every = request.param
     several = steps > 1
     changes = {
         "episodes": 14,
         "engine": engine,
         "ppo": {"rollout_steps": steps, "gae_lambda": 0.95, "centre_advantages": several},
-        "meta": {"hidden_units": 16, "horizon": 2},
+        "meta": {"hidden_units": 16, "horizon": 2, "learn_every": learn_every},
     }
     trainer = Watched(run_config(environment, "mace_full", 2, **changes))
     assert [record.episode for record in finish(trainer).records] == [*range(1, 15)]
@@ -156,7 +158,7 @@ def read_sequences(trainer: Watched) -> list[np.ndarray]:
         observed += [*item.episode.observations[:-1].astype(np.float64)]
         reader.normaliser.count = len(observed)
         reader.normaliser.mean = np.mean(observed, axis=0)
-        reader.normaliser.sum_of_squares = np.var(observed, axis=0) * len(observed)
+        reader.normaliser.std = np.std(observed, axis=0)
         reader.progress.update(item.episode.rewards.sum())
         sequences.append(reader.sequence(item.episode, item.bonus.reward, item.beta))
     return sequences
@@ -210,8 +212,8 @@ def test_direction_is_how_the_update_moves_with_beta(watched):
 
     for each in watched.rounds:
         steps = 1.0
-        if each.time:
-            steps = np.sqrt(each.square / (1 - 0.999**each.time)) + 1e-5
+        if each.decayed < 1:
+            steps = np.sqrt(each.square / (1 - each.decayed)) + 1e-5
         for number, found in enumerate(each.directions):
             change = (update(each, number, 1e-4) - update(each, number, -1e-4)) / 2e-4 / steps
             expected = change / np.linalg.norm(change)
@@ -222,13 +224,15 @@ def test_direction_is_how_the_update_moves_with_beta(watched):
 def test_each_beta_is_credited_with_its_own_effect(watched):
     """β weighed the update on its own episode, whose effect the next two rollouts' g_E show.
 
-    What reaches the LSTM, by another backward pass: for each episode of the rollout two before,
-    (credit - prior · way from the initial logit) · logit of the sequence that chose its β.
+    What reaches the LSTM, by another backward pass, once enough β are judged: for each episode of
+    the rollouts two and more before that it has not learned from, (credit - prior · way from the
+    initial logit) · logit of the sequence that chose its β.
     """
     config, config_ppo = watched.config.meta, watched.config.ppo
     chosen_from = iter([None, *read_sequences(watched)])  # by episode, from 0
     chosen = [[next(chosen_from) for _ in each.rollout] for each in watched.rounds]
     squares = weight = 0.0
+    known: list[tuple[float, np.ndarray]] = []  # judged and not learned from
     credits: list[np.ndarray] = []  # of the episodes of each round
     for number, each in enumerate(watched.rounds):
         advantages = np.concatenate([scaled(item, "extrinsic") for item in each.rollout])
@@ -250,12 +254,13 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
             credits[earlier][place] += along / usual * min(1, strength) * influence
         credits.append(np.zeros(len(each.rollout)))
         told = watched.diagnostics[number].beta_credit
-        known = number >= 2 and [
-            (min(max(credit / math.sqrt(2), -config.max_credit), config.max_credit), source)
-            for credit, source in zip(credits[number - 2], chosen[number - 2], strict=True)
-            if source is not None
-        ]
-        if not known:  # too early, or only the first β, which was given
+        if number >= 2:
+            known += [
+                (min(max(credit / math.sqrt(2), -config.max_credit), config.max_credit), source)
+                for credit, source in zip(credits[number - 2], chosen[number - 2], strict=True)
+                if source is not None  # but for the first β, which was given
+            ]
+        if len(known) < config.learn_every:
             assert each.learned == [] and math.isnan(told)
             continue
         assert told == pytest.approx(np.mean([credit for credit, _ in known]), rel=2e-2, abs=1e-3)
@@ -269,3 +274,4 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
         assert largest > 0
         (found,) = each.learned
         np.testing.assert_allclose(found, expected, rtol=2e-2, atol=5e-3 * largest)
+        known = []

@@ -37,7 +37,8 @@ def make(run_config):
     """`make(environment, **changes)`: curiosity as in a run of mace_full."""
 
     def build(environment="CartPole-v1", **changes) -> Curiosity:
-        changes = {"memory": {"write_every": 1}, "novelty": {"write_every": 1}} | changes
+        novelty = {"write_every": 1, "refresh_every": 1}
+        changes = {"memory": {"write_every": 1}, "novelty": novelty} | changes
         config = run_config(environment, "mace_full", 0, **changes)
         return factories.intrinsic_reward(config, environment_of(environment), Streams(0))
 
@@ -94,7 +95,7 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
     novelty = apart.novelty(arrived)
     entries = apart.memory.usage > 0
     mean, std = apart.normaliser.mean, apart.normaliser.std
-    keys, values = apart.memory.keys[entries].numpy(), apart.memory.values[entries].numpy()
+    keys, values = apart.memory.keys[entries], apart.memory.values[entries]
     assert len(keys) == 50 + 5 and np.abs(values[:, -1]).max() < 5
     found = curiosity.bonus(episode)
     for t, state in enumerate(arrived):
@@ -157,7 +158,7 @@ def test_memory_holds_one_step_in_write_every_across_episodes_and_each_last(make
                 expected.append([*states[t], *states[t + 1], rewards[t], returns[t]])
             count += 1
     memory = curiosity.memory
-    stored = np.hstack([memory.keys.numpy(), memory.values.numpy()])[: len(memory)]
+    stored = np.hstack([memory.keys, memory.values])[: len(memory)]
     assert stored.tolist() == expected
 
 
@@ -181,7 +182,8 @@ def test_the_outcome_of_a_chain_of_10_steps_is_remembered(make):
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
 def test_restored_curiosity_continues_to_the_bit(make, name):
-    every_fourth = {"memory": {"write_every": 4}, "novelty": {"write_every": 4}}
+    novelty = {"write_every": 4, "refresh_every": 50}  # so that 30 states wait for it
+    every_fourth = {"memory": {"write_every": 4}, "novelty": novelty}
     original, restored = make(name, **every_fourth), make(name, **every_fourth)
     rng = np.random.default_rng(0)
 

@@ -4,18 +4,34 @@ import math
 
 import numpy as np
 import pytest
+import torch
+from shared import Twin
 
 from mace_rl.agent.adam import Adam
 from mace_rl.bonus.density import DensityEstimator
 
 
 def made(size, hidden_units=16, scale=1.0, seed=0) -> DensityEstimator:
-    """An estimator with arbitrary weights, float64."""
+    """An estimator with arbitrary weights."""
     generator = np.random.default_rng(seed)
     model = DensityEstimator(size, hidden_units, "compiled", generator)
-    network = model.network
-    network.parameters = scale * generator.standard_normal(len(network.parameters)) * network.mask
+    parameters = model.network.parameters
+    parameters[:] = scale * generator.standard_normal(len(parameters)) * free(model)
     return model
+
+
+def free(model: DensityEstimator) -> np.ndarray:
+    """Which parameters are neither masked nor zeros added to the layout."""
+    return model.network.mask * Twin(model.network).own()
+
+
+def normal(model: DensityEstimator, x: np.ndarray) -> tuple[Twin, torch.Tensor]:
+    """log p of each row by torch.distributions in float64, [N]; and whose parameters it is of."""
+    twin, size = Twin(model.network), x.shape[1]
+    outputs = twin(x)
+    std = outputs[:, size:].clamp(min=-5).exp()
+    values = torch.distributions.Normal(outputs[:, :size], std).log_prob(torch.from_numpy(x))
+    return twin, values.sum(dim=1)
 
 
 def output_layer(model: DensityEstimator) -> tuple[np.ndarray, np.ndarray]:
@@ -25,36 +41,34 @@ def output_layer(model: DensityEstimator) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("size", [1, 2, 5, 15])
 def test_conditional_of_each_coordinate_depends_on_earlier_ones_only(size):
-    """With the other outputs silenced, log p is that conditional and known standard normals."""
-    x = np.random.default_rng(1).standard_normal(size)
-    for i in range(size):
-        model = made(size, hidden_units=32, scale=0.5)
-        silent = np.arange(2 * size) % size != i
-        weights, biases = output_layer(model)
-        weights[:, silent], biases[silent] = 0, 0
-
-        def conditional(point: np.ndarray, i=i, model=model) -> float:
-            others = -0.5 * point**2 - 0.5 * math.log(2 * math.pi)
-            return model.log_prob(point[None])[0] - others.sum() + others[i]
-
-        for j in range(size):
-            step = 1e-3 * (np.arange(size) == j)
-            slope = (conditional(x + step) - conditional(x - step)) / 2e-3
-            assert abs(slope) < 1e-9 if j > i else abs(slope) > 1e-6
+    """To the bit: its μ and σ change with those, and with no other."""
+    model = made(size, hidden_units=32, scale=0.5)
+    x = np.random.default_rng(1).standard_normal((1, size)).astype(np.float32)
+    before = model.network.forward(x).outputs[0]
+    for j in range(size):
+        changed = x + np.float32(0.5) * (np.arange(size) == j)
+        same = model.network.forward(changed).outputs[0] == before
+        assert same.tolist() == [i <= j for i in range(size)] * 2
 
 
+@pytest.mark.parametrize("narrow", [False, True])
 @pytest.mark.parametrize("size", [1, 2, 5])
-def test_gradient_of_the_log_density_by_finite_differences(size):
+def test_log_density_and_gradient_equal_autograd(size, narrow):
+    """Of normal distributions with the network's μ and σ, in double precision.
+
+    Of the first coordinate log σ is the bias alone; if `narrow`, below its bound.
+    """
     model = made(size, hidden_units=8, scale=0.5)
-    x = np.random.default_rng(1).standard_normal((7, size))
-    found = model.gradient(x)
-    parameters = model.network.parameters
-    for i, step in enumerate(1e-5 * np.eye(len(found))):
-        values = []
-        for model.network.parameters in (parameters + step, parameters - step):
-            values.append(model.log_prob(x).mean())
-        expected = (values[0] - values[1]) / 2e-5 * model.network.mask[i]
-        assert found[i] == pytest.approx(expected, rel=1e-5, abs=1e-8)
+    _, biases = output_layer(model)
+    biases[size] = -5.5 if narrow else -1.0
+    x = np.random.default_rng(1).standard_normal((200, size)).astype(np.float32)
+    twin, expected = normal(model, x)
+    np.testing.assert_allclose(model.log_prob(x), expected.detach(), rtol=1e-4, atol=1e-5)
+    found, expected = model.gradient(x), twin.gradient(expected.mean()) * free(model)
+    assert found.dtype == np.float32 and (found[free(model) == 0] == 0).all()
+    largest = np.abs(expected).max()
+    assert largest > 0.1
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * largest)
 
 
 @pytest.mark.parametrize("size", [1, 2])
@@ -65,7 +79,8 @@ def test_density_integrates_to_1(size, seed):
     totals = []
     for rows in np.array_split(axis, 30):
         points = np.stack(np.meshgrid(*[rows, axis][:size], indexing="ij"), axis=-1)
-        totals.append(np.exp(model.log_prob(points.reshape(-1, size))).sum())
+        points = points.reshape(-1, size).astype(np.float32)
+        totals.append(np.exp(model.log_prob(points)).sum(dtype=np.float64))
     assert sum(totals) * (axis[1] - axis[0]) ** size == pytest.approx(1, abs=1e-3)
 
 
@@ -74,7 +89,7 @@ def test_density_of_a_constant_stays_bounded():
     model = made(1)
     weights, biases = output_layer(model)
     weights[:], biases[:] = 0, [2.0, -50.0]
-    assert model.log_prob(np.array([[2.0]]))[0] == pytest.approx(5 - 0.5 * math.log(2 * math.pi))
+    assert model.log_prob(np.float32([[2.0]]))[0] == pytest.approx(5 - 0.5 * math.log(2 * math.pi))
 
 
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
@@ -94,6 +109,8 @@ def test_training_approaches_the_entropy_of_a_known_gaussian(engine):
         adam.step(-model.gradient(train[rng.integers(10_000, size=256)]))
     # Masked weights stay 0: of the 64 units half may see one input and half two, of three; and two
     # outputs may see no unit, two one half, and two all.
-    assert (adam.parameters == 0).sum() == 32 * 2 + 32 + 2 * (64 + 32)
+    parameters = adam.parameters[Twin(model.network).own()]
+    assert (parameters == 0).sum() == 32 * 2 + 32 + 2 * (64 + 32)
+    assert np.count_nonzero(adam.parameters) == np.count_nonzero(parameters)
     assert likelihoods[0] < likelihoods[1] < likelihoods[2]
     assert likelihoods[-1] == pytest.approx(-entropy, abs=0.08)

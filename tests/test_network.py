@@ -3,31 +3,46 @@
 import copy
 import math
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 import pytest
 import torch
 from numba import njit
 from scipy import special
-from shared import LAYER_NORM, layer_norm
+from shared import LAYER_NORM, laid_out, layer_norm
 
 from mace_rl.agent import kernels
 from mace_rl.agent.network import CompiledMLP, TorchNetwork, mlp, network
-from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork, meta_network, sigmoid
+from mace_rl.beta.lstm import (
+    CompiledMetaNetwork,
+    MetaNetwork,
+    TorchMetaNetwork,
+    meta_network,
+    sigmoid,
+)
 from mace_rl.bonus.density import CompiledAutoencoder, DensityEstimator, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 
 # --- Both engines -------------------------------------------------------------------------------
 
-CASES = []  # compiled form, torch module from a generator, shape of the inputs
+# Compiled form, torch module from a generator, shape of the inputs or shapes of several sequences.
+CASES = []
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
     CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
 CASES.append((TorchNetwork, lambda rng: layer_norm(6, 3, [16]), (20, 6)))
 for size in (1, 2, 15):
     CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
-for units, steps in product((1, 5, 128), (1, 32, 300)):
-    CASES.append((CompiledMetaNetwork, partial(MetaNetwork, 7, units, 0.4), (steps, 7)))
+for units, lengths in product((1, 5, 128), ([1], [300], [7, 32, 1, 32, 7])):
+    shapes = [(length, 7) for length in lengths]
+    CASES.append((CompiledMetaNetwork, partial(MetaNetwork, 7, units, 0.4), shapes))
+
+
+def drawn(rng: np.random.Generator, shape) -> np.ndarray | list[np.ndarray]:
+    """Standard normal inputs, float32; of a list of shapes a list."""
+    if isinstance(shape, list):
+        return [drawn(rng, one) for one in shape]
+    return rng.standard_normal(shape).astype(np.float32)
 
 
 @pytest.mark.parametrize(("compiled", "make", "shape"), CASES)
@@ -39,28 +54,36 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
         for part in module.parameters():
             free = (part != 0) | (part.ndim == 1)  # masked weights stay 0
             part += 0.3 * free * torch.from_numpy(rng.standard_normal(part.shape)).float()
-    inputs = rng.standard_normal(shape).astype(np.float32)
+    several = isinstance(shape, list)
+    inputs, general = drawn(rng, shape), TorchMetaNetwork if several else TorchNetwork
+
+    def answers(module: torch.nn.Module) -> torch.Tensor:
+        kind = next(module.parameters()).dtype
+        parts = inputs if several else [inputs]
+        return torch.cat([module(torch.from_numpy(part).to(kind)) for part in parts])
+
     double = copy.deepcopy(module).double()
-    expected = double(torch.from_numpy(inputs).double())
+    expected = answers(double)
     grad_outputs = rng.standard_normal(expected.shape)
     loss = (expected * torch.from_numpy(grad_outputs)).sum()
     gradients = [g.numpy() for g in torch.autograd.grad(loss, double.parameters())]
-    for one in (compiled(copy.deepcopy(module)), TorchNetwork(module)):
+    for one in (compiled(copy.deepcopy(module)), general(module)):
         trace = one.forward(inputs)
         np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
         one.backward(trace, np.ones_like(trace.outputs))  # β's credit goes back more than once
         found = one.backward(trace, grad_outputs.astype(np.float32))
-        transposed = isinstance(one, CompiledMLP)
-        flat = np.concatenate([(g.T if transposed else g).ravel() for g in gradients])
+        flat = laid_out(one, gradients)
         tolerance = 1e-4 * np.abs(flat).max()
         np.testing.assert_allclose(found, flat, rtol=1e-3, atol=tolerance)
         assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
-        assert found.shape == one.parameters.shape
+        added = laid_out(one, [np.ones_like(part) for part in gradients]) == 0
+        assert (found[added] == 0).all() and (one.parameters[added] == 0).all()
+        assert found.shape == one.parameters.shape == flat.shape
         other = type(one)(make(np.random.default_rng(1)))
         held = other.parameters
         other.load_module_state(copy.deepcopy(one.module().state_dict()))
         assert (other.parameters == one.parameters).all() and other.parameters is held
-        again = copy.deepcopy(one.module())(torch.from_numpy(inputs)).detach()
+        again = answers(copy.deepcopy(one.module())).detach()
         np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
 
 
@@ -71,11 +94,40 @@ def test_both_engines_start_alike(run_config):
         density = DensityEstimator(6, 8, engine, np.random.default_rng(3))
         policy = network(run_config().ppo, engine, 6, 2, 0.5, np.random.default_rng(3))
         meta = meta_network(6, 5, 0.3, engine, np.random.default_rng(3))
-        answers = [one.forward(inputs).outputs for one in (policy, meta)]
+        answers = policy.forward(inputs).outputs, meta.forward([inputs, inputs[:3]]).outputs
         return [*answers, density.log_prob(inputs), density.gradient(inputs).sum()]
 
     for one, other in zip(outputs("compiled"), outputs("torch"), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("hidden", [[1], [5, 17], [64, 64]])
+def test_the_forward_pass_of_one_observation_is_that_of_many_to_the_bit(hidden):
+    rng = np.random.default_rng(0)
+    one = CompiledMLP(mlp([6, *hidden, 3], 1.0, rng))
+    inputs = drawn(rng, (70, 6))
+    together = one.forward(inputs).outputs
+    assert len(np.unique(together)) > 200
+    for row, outputs in zip(inputs, together, strict=True):
+        assert (one.forward(row[None]).outputs[0] == outputs).all()
+
+
+@pytest.mark.parametrize("units", [1, 5, 128])
+def test_sequences_together_and_each_alone(units):
+    """Their logits are equal to the bit, whatever is beside them; gradients add up."""
+    rng = np.random.default_rng(0)
+    one = CompiledMetaNetwork(MetaNetwork(7, units, 0.4, rng))
+    one.own()[3][:] = rng.standard_normal(units)  # the readout
+    sequences = drawn(rng, [(length, 7) for length in (7, 32, 1, 32, 7, 12)])
+    weights = drawn(rng, (6,))
+    together = one.forward(sequences)
+    alone = [one.forward([sequence]) for sequence in sequences]
+    assert together.outputs.tolist() == [trace.outputs[0] for trace in alone]
+    assert len(set(together.outputs)) == 6
+    pairs = zip(alone, weights, strict=True)
+    expected = np.sum([one.backward(trace, weight[None]) for trace, weight in pairs], axis=0)
+    found = one.backward(together, weights)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
@@ -127,10 +179,9 @@ def over(function, values):
     return result
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_compiled_tanh_and_sigmoid(kind):
+def test_compiled_tanh_and_sigmoid():
     values = np.concatenate([np.linspace(-12, 12, 10_001), [0.0, 1e-30, 1e30, np.inf, -np.inf]])
-    values = values.astype(kind)
+    values = values.astype(np.float32)
     exact = np.tanh(values.astype(np.float64))
     found = over(kernels.tanh, values)
     assert np.abs(found - exact).max() < 2e-7
@@ -139,7 +190,17 @@ def test_compiled_tanh_and_sigmoid(kind):
     logistic = special.expit(values.astype(np.float64))
     assert np.abs(over(sigmoid, values) - logistic).max() < 2e-7
     for function in (kernels.tanh, sigmoid):  # or a run that goes bad is not noticed
-        assert np.isnan(over(function, np.full(17, np.nan, kind))).all()
+        assert np.isnan(over(function, np.full(17, np.nan, np.float32))).all()
+
+
+def test_a_permutation_is_uniform_if_the_draws_are():
+    """Draws from the middles of equal parts of [0, 1), so that each choice is equally often."""
+    middles = (np.arange(12) + 0.5) / 12
+    draws = np.stack(np.meshgrid([0.3], middles, middles, middles), axis=-1).reshape(-1, 4)
+    found, counts = np.unique(kernels.shuffled(draws), axis=0, return_counts=True)
+    assert found.tolist() == sorted(map(list, permutations(range(4))))
+    assert (counts == 12**3 / 24).all()
+    assert (kernels.shuffled(np.ones((2, 5))) == np.arange(5)).all()
 
 
 # --- Any torch module ---------------------------------------------------------------------------

@@ -22,6 +22,7 @@ def random_policy(space="Discrete", engine="compiled", hidden=(7, 6), scale=1.0,
     outputs = 4 if space == "Discrete" else 3
     policy = Policy(ENGINES[engine](mlp([SIZE, *hidden, outputs], 1.0, rng)), SPACES[space], 0.0)
     policy.parameters[:] = scale * rng.standard_normal(len(policy.parameters))
+    policy.parameters *= Twin(policy).own()
     return policy
 
 
@@ -64,10 +65,13 @@ def test_log_probs_and_gradient_equal_autograd(space, engine, scale, entropy_wei
     trace = policy.forward(observations)
     found = policy.log_probs(trace.outputs, actions)
     np.testing.assert_allclose(found, log_probs.detach(), rtol=1e-4, atol=1e-4)
-    found, entropy = policy.gradient(trace, actions, weights.astype(np.float32), entropy_weight)
+    sums = np.array([1.0, 2.0, 3.0])  # only the last one is the entropy's
+    weights = weights.astype(np.float32)
+    found = policy.gradient(trace, actions, weights, entropy_weight, sums)
     expected = twin.gradient(objective)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-    assert entropy == pytest.approx(total.item(), rel=1e-4)
+    assert sums.tolist() == pytest.approx([1, 2, 3 + total.item()], rel=1e-4)
+    assert (policy.gradient(trace, actions, weights, entropy_weight) == found).all()
 
 
 # --- Acting -------------------------------------------------------------------------------------
@@ -81,7 +85,7 @@ def test_acting_normalises_observations_and_follows_the_policy(engine, hidden):
     mean, std = rng.standard_normal(SIZE), np.exp(rng.standard_normal(SIZE))
     actor = policy.for_acting(mean, std, 1.5)
     assert isinstance(actor, CompiledActing if engine == "compiled" else NetworkActing)
-    policy.parameters += 0.1  # an update after the actor was made
+    policy.parameters += 0.1 * Twin(policy).own()  # an update after the actor was made
     observations = (mean + 2 * std * rng.standard_normal((200, SIZE))).astype(np.float32)
     normalised = np.clip((observations - mean) / std, -1.5, 1.5)
     assert (np.abs(normalised) == 1.5).any() and (np.abs(normalised) < 1.5).any()
@@ -95,11 +99,12 @@ def test_acting_normalises_observations_and_follows_the_policy(engine, hidden):
 def test_discrete_action_is_the_inverse_distribution_function(engine):
     policy, observation = random_policy(engine=engine), np.zeros(SIZE, np.float32)
     policy.parameters[:] = 0  # the same logits in every state: the biases
-    policy.parameters[-4:] = np.log([0.1, 0.2, 0.3, 0.4])
+    biases = policy.parameters[-16 if engine == "compiled" else -4 :][:4]
+    biases[:] = np.log([0.1, 0.2, 0.3, 0.4])
     uniforms = (0.0, 0.099, 0.101, 0.299, 0.301, 0.599, 0.601, np.nextafter(1, 0))
     drawn = [int(acting(policy).act(observation, uniform)[0]) for uniform in uniforms]
     assert drawn == [0, 0, 1, 1, 2, 2, 3, 3]
-    policy.parameters[-4:] = [500, -500, 0, -1000]  # very certain: logarithms stay finite
+    biases[:] = [500, -500, 0, -1000]  # very certain: logarithms stay finite
     for uniform in (0.0, 0.5, 0.999):
         assert acting(policy).act(observation, uniform) == (0, 0)
     outputs = policy.forward(observation[None].repeat(4, 0)).outputs
@@ -119,3 +124,17 @@ def test_box_actions_are_mean_plus_std_times_noise(engine):
     exact = (expected.mean + expected.stddev * torch.from_numpy(noise)).detach()
     np.testing.assert_allclose(actions, exact, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(log_probs, expected.log_prob(exact).detach(), rtol=1e-5, atol=1e-5)
+
+
+@both_spaces
+def test_acting_has_the_bits_of_the_batch(space):
+    """Or an update would begin with ratios that are not 1."""
+    policy = random_policy(space, hidden=(64, 64), scale=0.4)
+    observations, _ = steps(policy, 100)
+    rng = np.random.default_rng(8)
+    noise = rng.random(100) if policy.discrete else rng.standard_normal((100, 3))
+    drawn = [acting(policy).act(*pair) for pair in zip(observations, noise, strict=True)]
+    actions, log_probs = (np.array(parts) for parts in zip(*drawn, strict=True))
+    found = policy.log_probs(policy.forward(observations).outputs, actions)
+    assert found.dtype == np.float32 and (found == log_probs).all()
+    assert len(np.unique(found)) > 90

@@ -48,7 +48,6 @@ def test_a_training_is_the_same(run_config, tmp_path: Path, environment: str) ->
         json.loads((tmp_path / n / files.RECORD).read_text()) for n in ("plain", "strange")
     )
     assert one["outputs"] == other["outputs"]
-    assert one["arithmetic"] == other["arithmetic"]
 
 
 @pytest.mark.slow

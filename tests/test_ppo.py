@@ -10,6 +10,7 @@ import torch
 from shared import Twin
 
 from mace_rl.agent.adam import Adam
+from mace_rl.agent.network import Network, Trace
 from mace_rl.agent.ppo import PPO, Batch
 from mace_rl.streams import Streams
 
@@ -22,7 +23,8 @@ both_environments = pytest.mark.parametrize("environment", ENVIRONMENTS)
 def random_batch(ppo: PPO, count=40, seed=0, spread=0.4) -> Batch:
     """A batch whose log-probabilities are off by `spread`, so that many ratios are clipped."""
     rng, policy = np.random.default_rng(seed), ppo.policy
-    policy.parameters += 0.3 * rng.standard_normal(len(policy.parameters)).astype(np.float32)
+    own = Twin(policy).own()
+    policy.parameters += 0.3 * own * rng.standard_normal(len(own)).astype(np.float32)
     size = len(ppo.normaliser.mean)
     observations = rng.standard_normal((count, size)).astype(np.float32)
     outputs = policy.forward(observations).outputs
@@ -70,11 +72,13 @@ def test_actor_gradient_is_that_of_the_clipped_surrogate(
     advantage = torch.from_numpy(batch.advantages)
     assert len(torch.stack([ratio > 1.2, ratio < 0.8, advantage > 0], dim=1).unique(dim=0)) == 6
     expected = twin.gradient(-mean - entropy_coefficient * policy.entropy().mean())
-    gradient, *told = ppo.actor_gradient(batch)
+    sums = np.array([100.0, 200.0, 300.0])  # of other minibatches
+    gradient = ppo.actor_gradient(batch, sums)
     np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-5)
     outside = (ratio > 1.2) | (ratio < 0.8)
-    means = (ratio - 1 - ratio.log()).mean(), outside.double().mean(), policy.entropy().mean()
-    assert told == pytest.approx([mean.item() for mean in means], rel=1e-4)
+    told = (ratio - 1 - ratio.log()).sum(), outside.sum(), policy.entropy().sum()
+    expected = [before + total.item() for before, total in zip((100, 200, 300), told, strict=True)]
+    assert sums.tolist() == pytest.approx(expected, rel=1e-5)
 
 
 @both_engines
@@ -125,6 +129,15 @@ def test_a_preconditioned_direction_by_hand():
     torch.testing.assert_close(adam.state_dict(), state, rtol=0, atol=0)  # asking is not stepping
 
 
+def fisher_yates(draws: np.ndarray) -> list[int]:
+    """From the last place to the first one, each chosen from those before it and itself."""
+    order = list(range(len(draws)))
+    for place in reversed(range(1, len(draws))):
+        other = math.floor(draws[place] * (place + 1))
+        order[place], order[other] = order[other], order[place]
+    return order
+
+
 @both_engines
 @both_environments
 @pytest.mark.parametrize(
@@ -149,11 +162,10 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
         name: torch.optim.Adam(twin.parameters(), lr=rates[name], eps=1e-5)
         for name, twin in twins.items()
     }
-    order = Streams(5)["minibatches"]
-    # As even as can be, the larger ones first.
-    sizes = {None: [700], 256: [234, 233, 233], 45: [44] * 12 + [43] * 4}[minibatch_size]
-    for _ in range(4):
-        places = order.permutation(700) if minibatch_size else np.arange(700)
+    draws = Streams(5)["minibatches"].random((4, 700))
+    sizes = {None: [700], 256: [233, 233, 234], 45: [43, 44, 44, 44] * 4}[minibatch_size]
+    for epoch in range(4):
+        places = fisher_yates(draws[epoch]) if minibatch_size else np.arange(700)
         told, norms = np.zeros(3), {}  # of the last epoch, and of its last minibatch
         ends = np.cumsum([0, *sizes])
         for part in (batch[places[a:b]] for a, b in pairwise(ends)):
@@ -182,3 +194,63 @@ def test_update_equals_a_reference_loop(make_ppo, environment, changes, engine):
         expected, found = twin.flat(twin.parameters()), ppo.optimisers[name].parameters
         assert np.abs(found - before[name]).max() > 1e-3
         np.testing.assert_allclose(found, expected, atol=2e-5, err_msg=name)
+
+
+class StepByStep:
+    """A compiled network that nobody can tell from any other, so that updates take the long way."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    @property
+    def parameters(self) -> np.ndarray:
+        return self.network.parameters
+
+    def forward(self, inputs: np.ndarray) -> Trace:
+        return self.network.forward(inputs)
+
+    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
+        return self.network.backward(trace, grad_outputs)
+
+
+@both_environments
+@pytest.mark.parametrize("entropy_coefficient", [0.0, 0.05])
+@pytest.mark.parametrize("minibatch_size", [None, 256, 64, 45])
+def test_the_compiled_update_has_the_bits_of_step_by_step(
+    make_ppo, environment, entropy_coefficient, minibatch_size
+):
+    """Weights, Adam's state and what the update tells; zeros added to the layers stay zeros."""
+    settings = {"minibatch_size": minibatch_size, "entropy_coefficient": entropy_coefficient}
+    made = [make_ppo(environment, 5, intrinsic=True, **settings) for _ in range(2)]
+    batches = [random_batch(ppo, count=700, spread=0.2) for ppo in made]
+    start = made[0].policy.parameters.copy()
+    general, steps = made[1], 0
+    for owner in (general.policy, *general.critics.values()):
+        owner.network = StepByStep(owner.network)
+    take = Adam.step
+    with pytest.MonkeyPatch.context() as patch:
+
+        def counted(self: Adam, gradient: np.ndarray) -> float:
+            nonlocal steps
+            steps += 1
+            return take(self, gradient)
+
+        patch.setattr(Adam, "step", counted)
+        updates = []
+        for ppo, batch in zip(made, batches, strict=True):
+            assert steps == 0  # in one call
+            updates.append([ppo.update(batch[:690]), ppo.update(batch)])
+    count = 1 if minibatch_size is None else math.ceil(700 / minibatch_size)
+    assert steps == 3 * 4 * 2 * count  # networks, epochs, updates
+    assert updates[0] == updates[1]
+    assert updates[0][1].clip_fraction > 0 and min(updates[0][1].gradient_norms.values()) > 0
+    assert (made[0].policy.parameters != start).mean() > 0.5
+    states = [ppo.state_dict() for ppo in made]
+    assert states[0].pop("minibatches") == states[1].pop("minibatches")
+    torch.testing.assert_close(*states, rtol=0, atol=0)
+    twins = {"actor": Twin(made[0].policy)} | {k: Twin(v) for k, v in made[0].critics.items()}
+    for name, twin in twins.items():
+        added, adam = ~twin.own(), made[0].optimisers[name]
+        assert added.any()
+        for array in (adam.parameters, adam.mean, adam.square):
+            assert (array[added] == 0).all() and (array[~added] != 0).mean() > 0.9

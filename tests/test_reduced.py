@@ -1,20 +1,11 @@
-"""docs/reduced, which `make quick` gives again to the byte, from kept runs without training.
+"""docs/reduced, which `make quick` gives again to the byte: its trainings, tables and figures."""
 
-A run's first episodes do not depend on its budget, so those of the study's runs are the reduced
-ones.
-"""
-
-import io
-import json
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from shared import VARIANTS, finish
 
-from mace_rl import files
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check
 from mace_rl.config.study import read_study
 from mace_rl.results.figures import (
     Look,
@@ -26,37 +17,25 @@ from mace_rl.results.figures import (
 )
 from mace_rl.results.latex import table1_latex
 from mace_rl.results.metrics_table import metrics_table
-from mace_rl.results.records import RunKey, read_episodes
+from mace_rl.results.records import EpisodeRecord, RunKey, as_columns
 from mace_rl.results.summary import summary, table1
-from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
-EXPECTED, KEPT = ROOT / "docs" / "reduced", ROOT / "reference" / "study"
+EXPECTED = ROOT / "docs" / "reduced"
 STUDY = read_study([ROOT / "config.yaml", ROOT / "config" / "reduced.yaml"])
 METRICS = STUDY.metrics.within(STUDY.environments, STUDY.variants)
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> dict[RunKey, pd.DataFrame]:
+def runs() -> dict[RunKey, pd.DataFrame]:
     """The records of the reduced study's runs."""
-    cut, frames = tmp_path_factory.mktemp("reduced") / files.EPISODES, {}
-    kept = {
-        (environment, variant): kept_runs.read(KEPT / environment / f"{variant}.tar.xz")
-        for environment in STUDY.environments
-        for variant in STUDY.variants
+    return {
+        key: pd.DataFrame(as_columns(EpisodeRecord, finish(STUDY.run_config(*key)).records))
+        for key in STUDY.runs()
     }
-    for environment, variant, seed in STUDY.runs():
-        content = kept[environment, variant]
-        config = STUDY.run_config(environment, variant, seed)
-        record = json.loads(content[f"seed{seed}/{files.RECORD}"])
-        settings = check(RunConfig, record["config"], "the kept run").settings()
-        assert settings | {"episodes": config.episodes} == config.settings()
-        lines = io.BytesIO(content[f"seed{seed}/{files.EPISODES}"]).readlines()
-        cut.write_bytes(b"".join(lines[: config.episodes + 1]))
-        frames[environment, variant, seed] = read_episodes(cut, config.episodes)
-    return frames
 
 
+@pytest.mark.slow
 def test_table_1(runs):
     metrics = metrics_table(runs, METRICS)
     table = table1(summary(metrics, METRICS))
@@ -65,6 +44,7 @@ def test_table_1(runs):
     assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_figures(runs, tmp_path, number):
     shown = quantity(number, STUDY.metrics)

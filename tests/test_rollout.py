@@ -86,7 +86,7 @@ def test_both_rollouts_play_the_same_episodes(name, kind):
         # The compiled loop's own state, in double precision, which the next step would start from.
         start, final = (np.array(each.env.unwrapped.state, np.float64) for each in (one, other))
         which = classic_control.CARTPOLE if name == "CartPole-v1" else classic_control.ACROBOT
-        classic_control.episode(which, start, again.observations[0], *policy[:5], noise)
+        classic_control.episode(which, start, again.observations[0], policy, noise)
         assert start.tobytes() == final.tobytes()
     assert one.generator.bit_generator.state == other.generator.bit_generator.state
     if kind == "skilled":  # the policies do what they are here for

@@ -173,7 +173,8 @@ def test_resumed_run_equals_uninterrupted_run(
     run_config, tmp_path, kill, checkpoint_every, completes, environment, changes, variant
 ):
     """Killed twice, between checkpoints, so that lost rounds are played again."""
-    config = run_config(environment, variant, 4, episodes=30 if changes else 8, **changes)
+    changes = {"episodes": 30 if changes else 8, "novelty": {"refresh_every": 40}} | changes
+    config = run_config(environment, variant, 4, **changes)
     checkpoint_every(2)
     for update in (4, 7):
         kill(update, config, tmp_path / "killed")

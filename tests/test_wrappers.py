@@ -35,7 +35,7 @@ from mace_rl.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
 # hold.
 SMALL = {
     "memory": {"capacity": 60, "write_every": 3},
-    "novelty": {"buffer_size": 120, "write_every": 2, "neighbours": [3, 8, 5]},
+    "novelty": {"buffer_size": 120, "write_every": 2, "neighbours": [3, 8, 5], "refresh_every": 30},
 }
 RANDOM = {"kind": "random", "low": 0.2, "high": 0.7}
 BANDIT = {"kind": "bandit", "arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
@@ -515,7 +515,8 @@ def test_what_goes_wrong_stops_it(env, error, message):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_state_that_is_not_finite_is_noticed_at_once_when_novelty_is_estimated(value):
-    env = CuriosityReward(Odd(), novelty={"neighbours": [1], "write_every": 1})
+    novelty = {"neighbours": [1], "write_every": 1, "refresh_every": 1}
+    env = CuriosityReward(Odd(), novelty=novelty)
     play(env, 20)
     env.env.state = value
     with pytest.raises(NonFiniteError, match="the curiosity bonus is nan"):

@@ -4,10 +4,10 @@ import os
 import sys
 from pathlib import Path
 
-from mace_rl import arithmetic
+from mace_rl.pins import pin
 from mace_rl.sources import PACKAGE, digest
 
-arithmetic.prepare()  # before NumPy and what computes with it is imported
+pin()  # before NumPy and what computes with it is imported
 
 # numba's cache on disk does not notice an edit in another file than the cached function's own, so
 # each state of this package gets a folder to itself. numba reads the variable when it is imported.

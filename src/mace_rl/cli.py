@@ -140,8 +140,8 @@ def _require(fits: bool, option: str, value: object, right: str) -> None:
 def finished(config: RunConfig, directory: Path) -> bool:
     """Whether `directory` holds the results of this run, whole and as it would come out now.
 
-    Raises `ConfigError` if they are damaged, of another run, or of other code, versions or
-    arithmetic, as a checkpoint of those is not continued.
+    Raises `ConfigError` if they are damaged, of another run, or of other code or versions, as a
+    checkpoint of those is not continued.
     """
     if not (directory / files.RECORD).exists():
         return False

@@ -5,8 +5,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mace_rl.agent.advantages import variance
+from mace_rl.agent.advantages import mean, variance
 from mace_rl.agent.ppo import Update
+from mace_rl.agent.products import dot
 from mace_rl.experience import Experience, extrinsic_part, intrinsic_part
 from mace_rl.results.records import UpdateRecord
 
@@ -33,12 +34,12 @@ def diagnose(
         if getattr(rollout[0].bonus, part) is None:  # a bonus that has no such part
             return math.nan
         values = stacked(getattr(item.bonus, part) for item in rollout)
-        return float(values.sum() / len(values))
+        return mean(values)
 
     has_bonus = rollout[0].bonus is not None
     own = stacked(extrinsic_part(item) for item in rollout)
     added = stacked(item.beta * intrinsic_part(item) for item in rollout)
-    extrinsic, weighted = float(own @ own), float(added @ added)
+    extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,

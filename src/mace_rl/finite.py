@@ -1,6 +1,9 @@
 """Numbers that go bad stop the run."""
 
+import math
+
 import numpy as np
+from numba import njit
 
 from mace_rl.refusal import Refusal
 
@@ -11,7 +14,8 @@ class NonFiniteError(Refusal, ArithmeticError):
 
 def require_finite(name: str, values: float | np.ndarray, where: str = "") -> None:
     """Raise `NonFiniteError` if `values` has a NaN or Inf; `where` ends the message."""
-    if not np.isfinite(values).all():
+    good = math.isfinite(values) if isinstance(values, float) else all_finite(values)
+    if not good:
         found = np.asarray(values)
         bad = found[~np.isfinite(found)].ravel()[0]
         raise NonFiniteError(f"{name} is {bad}{where}")
@@ -29,3 +33,12 @@ def require_share(
     outside = found[(found < -rounding) | (found > largest + rounding)].ravel()
     if len(outside):
         raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, {largest:g}]")
+
+
+@njit(cache=True)
+def all_finite(values: np.ndarray) -> bool:
+    """Whether an array of any shape has neither NaN nor Inf."""
+    good = True
+    for value in values.flat:
+        good &= np.isfinite(value)
+    return good

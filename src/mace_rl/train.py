@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import normalised, normalised_change, root_mean_square
+from mace_rl.agent.advantages import (
+    mean,
+    normalised,
+    normalised_change,
+    root_mean_square,
+    total,
+)
 from mace_rl.agent.ppo import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
@@ -124,8 +130,8 @@ class Trainer:
                 episode=len(self.records) + 1,
                 env_steps=before + len(episode),
                 length=len(episode),
-                extrinsic_return=float(episode.rewards.sum()),
-                intrinsic_return=float(reward.sum()),
+                extrinsic_return=total(episode.rewards),
+                intrinsic_return=total(reward),
                 beta=beta,
                 terminated=int(episode.terminated),
             )
@@ -155,7 +161,7 @@ class Trainer:
         centred = self.config.ppo.centre_advantages
         extrinsic = np.concatenate([extrinsic_part(item) for item in rollout])
         if centred:
-            extrinsic -= extrinsic.mean()
+            extrinsic -= mean(extrinsic)
         total = total_advantages(rollout)
         changes = [normalised_change(total, part, centred) for part in intrinsic_parts(rollout)]
         gradient, *changes = self.ppo.policy_gradients(*steps(rollout), [extrinsic, *changes])

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import gymnasium
-from mace_rl import arithmetic, files
+from mace_rl import files
 from mace_rl.config.reading import merge, read_yaml, typed
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study

@@ -23,6 +23,5 @@ rule train:
         config=lambda wildcards: run_config(wildcards).settings(),
         code=lambda wildcards: code("train.py", run_config(wildcards)),
         versions=provenance.versions(),
-        arithmetic=arithmetic.chosen(),
     script:
         "../scripts/train.py"

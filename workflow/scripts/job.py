@@ -9,8 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mace_rl import arithmetic
-
 PATIENCE = 1.0  # seconds between looks at whether Snakemake is alive
 
 logger = logging.getLogger("job")
@@ -45,7 +43,6 @@ def job(title: str, log: str) -> Iterator[None]:
     start = time.monotonic()
     try:
         yield
-        arithmetic.require()  # of the libraries that the body loaded
     except Exception as error:
         logger.exception("%s failed", title)
         said = "; ".join([str(error), *getattr(error, "__notes__", ())])

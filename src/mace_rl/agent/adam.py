@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
+
+from mace_rl.agent.kernels import kernel
+from mace_rl.agent.products import dot
 
 DECAY_MEAN, DECAY_SQUARE, EPSILON = 0.9, 0.999, 1e-5  # β₁, β₂ and ε
 
@@ -27,16 +29,17 @@ class Adam:
         self.learning_rate = learning_rate
         self.max_gradient_norm = max_gradient_norm
         self.mean, self.square = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
-        self.time = 0
+        self.decayed = np.ones(2)  # β₁ᵗ and β₂ᵗ after t steps
 
     def step(self, gradient: np.ndarray) -> float:
         """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
-        norm = float(np.sqrt(gradient @ gradient))
-        if norm > self.max_gradient_norm:
-            gradient = gradient * np.float32(self.max_gradient_norm / norm)
-        self.time += 1
-        adam(self.parameters, gradient, self.mean, self.square, self.time, self.learning_rate)
-        return norm
+        return step(gradient, *self.state)
+
+    @property
+    def state(self) -> tuple[Any, ...]:
+        """What the compiled `step` takes beside the gradient."""
+        rates = self.learning_rate, self.max_gradient_norm
+        return self.parameters, self.mean, self.square, self.decayed, *rates
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """`direction`, [n], in the units in which this optimiser steps: over √v̂ + ε, float32 [n].
@@ -44,44 +47,39 @@ class Adam:
         v̂ is the second moment after the steps so far; before the first one nothing is known of it
         and the direction is returned.
         """
-        if self.time == 0:
+        if self.decayed[1] == 1:
             return direction
-        unbiased = self.square / np.float32(1 - DECAY_SQUARE**self.time)
+        unbiased = self.square / np.float32(1 - self.decayed[1])
         return direction / (np.sqrt(unbiased) + np.float32(EPSILON))
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters and the optimiser's moments."""
-        arrays = {"parameters": self.parameters, "mean": self.mean, "square": self.square}
-        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()} | {
-            "time": self.time
-        }
+        names = ("parameters", "mean", "square", "decayed")
+        return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned, in place: the network holds the same arrays."""
-        self.parameters[:] = state["parameters"].numpy()
-        self.mean[:] = state["mean"].numpy()
-        self.square[:] = state["square"].numpy()
-        self.time = state["time"]
+        for name, value in state.items():
+            getattr(self, name)[:] = value.numpy()
 
 
-@njit(cache=True, error_model="numpy")
-def adam(
-    parameters: np.ndarray,
-    gradient: np.ndarray,
-    mean: np.ndarray,
-    square: np.ndarray,
-    time: int,
-    learning_rate: float,
-) -> None:
-    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; all arrays float32 [n].
+@kernel
+def step(gradient, parameters, mean, square, decayed, learning_rate, max_gradient_norm):
+    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; see `Adam.step`.
 
-    mean and square are the moments' running estimates, time counts steps from 1.
+    gradient, parameters and the moments' running estimates, mean and square: float32 [n].
     """
-    rate = np.float32(learning_rate / (1 - DECAY_MEAN**time))
-    scale = np.float32(1 / math.sqrt(1 - DECAY_SQUARE**time))
+    norm = math.sqrt(dot(gradient, gradient))
+    clipped = np.float32(max_gradient_norm / norm if norm > max_gradient_norm else 1)
+    decayed[0] *= DECAY_MEAN
+    decayed[1] *= DECAY_SQUARE
+    rate = np.float32(learning_rate / (1 - decayed[0]))
+    scale = np.float32(1 / math.sqrt(1 - decayed[1]))
     keep_mean, keep_square = np.float32(DECAY_MEAN), np.float32(DECAY_SQUARE)
     add_mean, add_square = np.float32(1 - DECAY_MEAN), np.float32(1 - DECAY_SQUARE)
     for i in range(len(parameters)):
-        mean[i] = keep_mean * mean[i] + add_mean * gradient[i]
-        square[i] = keep_square * square[i] + add_square * gradient[i] * gradient[i]
+        slope = clipped * gradient[i]
+        mean[i] = keep_mean * mean[i] + add_mean * slope
+        square[i] = keep_square * square[i] + add_square * slope * slope
         parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(EPSILON))
+    return norm

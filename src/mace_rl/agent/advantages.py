@@ -3,10 +3,12 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mace_rl.agent.kernels import kernel
+from mace_rl.agent.products import dot
 
 
-@njit(cache=True)
+@kernel
 def generalised_advantages(
     rewards: np.ndarray, values: np.ndarray, discount: float, gae_lambda: float
 ) -> np.ndarray:
@@ -25,43 +27,57 @@ def generalised_advantages(
     return result
 
 
+@kernel
 def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
-    """Advantages with root mean square 1, [N]; if `centred`, with mean 0 too.
+    """Advantages with root mean square 1, float64 [N]; if `centred`, with mean 0 too.
 
     A rollout is often one episode. To centre it is to forget whether it went better or worse than
     expected as a whole, and to blow up what is left, which in an episode that went well all the way
     is noise.
     """
     if centred:
-        advantages = advantages - advantages.mean()
+        advantages = advantages - mean(advantages)
     return advantages / (root_mean_square(advantages) + 1e-8)
 
 
+@kernel
 def normalised_change(advantages: np.ndarray, change: np.ndarray, centred: bool) -> np.ndarray:
     """d normalised(advantages + ε · change) / dε at ε = 0, [N].
 
     What of the change is parallel to the advantages is lost in the normalisation.
     """
     if centred:
-        advantages, change = advantages - advantages.mean(), change - change.mean()
+        advantages, change = advantages - mean(advantages), change - mean(change)
     spread = root_mean_square(advantages) + 1e-8
     direction = advantages / spread
-    return (change - direction * (direction @ change / len(change))) / spread
+    return (change - direction * (dot(direction, change) / len(change))) / spread
 
 
+@kernel
 def root_mean_square(values: np.ndarray) -> float:
     """√(Σ x² / N)."""
-    return math.sqrt(values @ values / len(values))
+    return math.sqrt(dot(values, values) / len(values))
 
 
-@njit(cache=True)
+@kernel
+def total(values: np.ndarray) -> float:
+    """Σ x of float64 [N], in order."""
+    result = 0.0
+    for value in values:
+        result += value
+    return result
+
+
+@kernel
+def mean(values: np.ndarray) -> float:
+    """Σ x / N."""
+    return total(values) / len(values)
+
+
+@kernel
 def variance(values: np.ndarray) -> float:
-    """Mean squared deviation from the mean of float64 [N]; several times faster than NumPy's."""
-    mean = 0.0
+    """Mean squared deviation from the mean of float64 [N]."""
+    centre, squares = mean(values), 0.0
     for value in values:
-        mean += value
-    mean /= len(values)
-    total = 0.0
-    for value in values:
-        total += (value - mean) ** 2
-    return total / len(values)
+        squares += (value - centre) ** 2
+    return squares / len(values)

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.agent.ppo import Batch
+from mace_rl.agent.ppo import Batch, Minibatches
 from mace_rl.config.agent import DictionaryValue
-from mace_rl.nearest import nearest
+from mace_rl.nearest import Neighbours
 
 # States closer than this are the same: mean squared difference in standard deviations. It is what
 # rounding leaves of no difference when a normalisation is undone.
@@ -60,7 +60,7 @@ class DictionaryCritic:
         weights = 1 / (squares.astype(np.float64) + self.config.kernel_bandwidth)
         return (weights * self.returns[indices]).sum(1) / weights.sum(1)
 
-    def learn(self, batch: Batch) -> float:
+    def learn(self, batch: Batch, minibatches: Minibatches) -> float:
         """See `Critic`: there is no gradient."""
         return 0.0
 
@@ -99,8 +99,8 @@ class DictionaryCritic:
     def search(self, states: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """The nearest entries to each state, [N, count]: d² per dimension, and which they are."""
         stored = len(self)
-        scale = self.normaliser.mean.astype(np.float32), self.normaliser.std.astype(np.float32)
-        squares, indices = nearest(states, self.keys[:stored], *scale, min(count, stored))
+        entries = Neighbours(self.keys[:stored], self.normaliser.mean, self.normaliser.std)
+        squares, indices = entries.nearest(states, min(count, stored))
         return squares / np.float32(states.shape[1]), indices
 
     def module(self) -> torch.nn.Module:

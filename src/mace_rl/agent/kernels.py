@@ -1,120 +1,175 @@
 """The compiled functions of the networks and the policy (numba).
 
 Networks of 64 units are too small for a tensor library, whose calls cost more than the work in
-them. Acting is float32 in a fixed order of operations, so the ordinary rollout, which calls
-`act_discrete` or `act_box` step by step, and the compiled one, which runs the same functions inside
-its loop, take the same actions to the bit.
+them. All arithmetic is float32, in an order that is written here or in `products` and `elementary`,
+so the bits are the same on every processor, for one state as for many, step by step as in one loop.
 
-A network is a flat vector of parameters, per layer the weights [in, out] row by row, then the
-biases [out], and its sizes, int64 [layers + 1].
+A network is a flat vector of parameters and its sizes, int64 [layers + 1]. A layer's parameters are
+its weights and, as the last row, its biases, [in + 1, padded out]: products want their columns in
+multiples of 16, so columns of zeros are added. Their gradient is 0, so they stay zeros.
 """
 
 import math
 
 import numpy as np
-import scipy.linalg.cython_blas  # noqa: F401  (np.dot's, loaded before threads are limited)
 from numba import njit
 
-# "contract" lets a product and a sum become one instruction; more than that would lose NaN, by
-# which a run that goes bad is noticed. Division by zero is Inf, not an error, which would keep
-# loops from becoming vector operations.
-kernel = njit(cache=True, fastmath={"contract"}, error_model="numpy")
+from mace_rl.agent.elementary import exp, log, tanh
+from mace_rl.agent.products import add_product, by_tiles, dot, padded, product
+
+# Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
+kernel = njit(cache=True, error_model="numpy")
+HALF_LOG_TAU = 0.9189385332046727  # log √(2π)
+f32 = np.float32
 
 
 @kernel
-def tanh(x):
-    """Hyperbolic tangent of a float32 or float64 to 2e-7, as arithmetic that loops vectorise.
-
-    tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction cut off
-    after its seventh term: an error of 1e-8, and float32's rounding, by which the result can exceed
-    1. From x = 9.2 on all is 1 in float32. NaN stays NaN: mind the order of arguments below.
-    """
-    y = x * np.float32(0.5)
-    y = min(max(y, np.float32(-4.6)), np.float32(4.6))
-    s = y * y
-    p = y * (((s + np.float32(378)) * s + np.float32(17325)) * s + np.float32(135135))
-    q = ((np.float32(28) * s + np.float32(3150)) * s + np.float32(62370)) * s + np.float32(135135)
-    return np.float32(2) * p * q / (q * q + p * p)
+def room_for(count, sizes):
+    """Room for what every layer puts out for `count` inputs, flat: [count, padded out] each."""
+    width = 0
+    for outs in sizes[1:]:
+        width += padded(outs)
+    return np.empty(count * width, np.float32)
 
 
 @kernel
-def network_outputs(activations, parameters, sizes):
-    """Fill in a tanh network's activations for N inputs.
+def forward(inputs, parameters, sizes, activations):
+    """A tanh network's outputs for N inputs, a view of `activations`, [N, padded out].
 
-    activations: the inputs, [N, sizes[0]], then an array to fill for each layer, [N, sizes[1]] ...,
-    the outputs last; contiguous and of one type, as a tuple.
+    inputs: [N, in]; activations: from `room_for` at least N, filled with what every layer puts out.
     """
-    start = 0
+    below, below_row = inputs.ctypes.data, inputs.shape[1]
+    weights, end, width = parameters.ctypes.data, 0, 0
     for layer in range(len(sizes) - 1):
-        inputs, outputs = sizes[layer], sizes[layer + 1]
-        biases = start + inputs * outputs
-        result = activations[layer + 1]
-        np.dot(activations[layer], parameters[start:biases].reshape(inputs, outputs), result)
-        start = biases + outputs
-        bias = parameters[biases:start]
+        ins, width = sizes[layer], padded(sizes[layer + 1])
+        bias = weights + 4 * ins * width
+        above = activations[end : end + len(inputs) * width]
+        by_tiles(
+            *(below, below_row, 1, weights, width, bias, 0),
+            *(above.ctypes.data, width, len(inputs), width, ins),
+        )
         if layer < len(sizes) - 2:
-            for n in range(len(result)):
-                for j in range(outputs):
-                    result[n, j] = tanh(result[n, j] + bias[j])
-        else:
-            for n in range(len(result)):
-                for j in range(outputs):
-                    result[n, j] += bias[j]
+            for k in range(len(above)):
+                above[k] = tanh(above[k])
+        below, below_row, weights = above.ctypes.data, width, bias + 4 * width
+        end += len(above)
+    return activations[end - len(inputs) * width : end].reshape(len(inputs), width)
 
 
 @kernel
-def network_gradient(activations, grad_outputs, parameters, sizes):
-    """Gradient, [n], with respect to the parameters of a loss.
+def transposed(parameters, sizes):
+    """The weights of each layer but the first, transposed for `backward`, [out, padded in]."""
+    total = 0
+    for layer in range(1, len(sizes) - 1):
+        total += sizes[layer + 1] * padded(sizes[layer])
+    result = np.zeros(total, np.float32)
+    start, place = (sizes[0] + 1) * padded(sizes[1]), 0
+    for layer in range(1, len(sizes) - 1):
+        ins, outs = sizes[layer], sizes[layer + 1]
+        end = start + (ins + 1) * padded(outs)
+        weights = parameters[start:end].reshape(ins + 1, padded(outs))
+        for j in range(outs):
+            row = result[place : place + ins]
+            for i in range(ins):
+                row[i] = weights[i, j]
+            place += padded(ins)
+        start = end
+    return result
 
-    grad_outputs: the loss's gradient at the outputs, [N, out]; activations: as `network_outputs`
-    left them. Parameters past the last layer's get 0.
+
+@kernel
+def backward(inputs, activations, grad_outputs, back, sizes, gradient, room):
+    """Add to `gradient`, like the parameters, that of a loss.
+
+    inputs, activations: of `forward`; grad_outputs: the loss's gradient at the outputs, [N, padded
+    out], with zeros in the columns added; back: the weights `transposed`; room: like `activations`,
+    overwritten.
     """
-    gradient = np.zeros_like(parameters)
-    grad = grad_outputs
-    end = 0
+    count, ones = len(inputs), np.ones((1, len(inputs)), np.float32)
+    end = place = below_end = 0
     for layer in range(len(sizes) - 1):
-        end += (sizes[layer] + 1) * sizes[layer + 1]
-    for layer in range(len(sizes) - 2, -1, -1):
-        inputs, outputs = sizes[layer], sizes[layer + 1]
-        biases = end - outputs
-        start = biases - inputs * outputs
-        hidden = activations[layer]
-        np.dot(hidden.T, grad, gradient[start:biases].reshape(inputs, outputs))
-        bias = gradient[biases:end]
-        for n in range(len(grad)):
-            for j in range(outputs):
-                bias[j] += grad[n, j]
+        end += (sizes[layer] + 1) * padded(sizes[layer + 1])
         if layer > 0:
-            weights = parameters[start:biases].reshape(inputs, outputs)
-            grad = np.dot(grad, weights.T)
-            flat, flat_hidden = grad.ravel(), hidden.ravel()
-            for k in range(len(flat)):
-                flat[k] *= np.float32(1) - flat_hidden[k] * flat_hidden[k]  # tanh'
+            place += sizes[layer + 1] * padded(sizes[layer])
+            below_end += count * padded(sizes[layer])
+    grad = grad_outputs
+    for layer in range(len(sizes) - 2, -1, -1):
+        ins, outs = sizes[layer], sizes[layer + 1]
+        start = end - (ins + 1) * padded(outs)
+        change = gradient[start:end].reshape(ins + 1, padded(outs))
         end = start
+        add_product(ones, grad, change[ins:])
+        if layer == 0:
+            add_product(inputs.T, grad, change[:ins])
+            break
+        below_start, width = below_end - count * padded(ins), padded(ins)
+        below, flat = activations[below_start:below_end], room[below_start:below_end]
+        below_end = below_start
+        add_product(below.reshape(count, width).T, grad, change[:ins])
+        weights = back[place - outs * width : place].reshape(outs, width)
+        place -= outs * width
+        grad_below = flat.reshape(count, width)
+        product(grad, weights, np.zeros(width, np.float32), grad_below)
+        for k in range(len(flat)):
+            flat[k] *= f32(1) - below[k] * below[k]  # tanh'
+        grad = grad_below
+
+
+@kernel
+def network_outputs(inputs, parameters, sizes):
+    """A tanh network's outputs for N inputs, [N, out], and its activations."""
+    activations = room_for(len(inputs), sizes)
+    outputs = forward(inputs, parameters, sizes, activations)
+    return outputs[:, : sizes[-1]].copy(), activations
+
+
+@kernel
+def network_gradient(inputs, activations, parameters, grad_outputs, sizes):
+    """Gradient, like the parameters, of a loss.
+
+    activations: of `network_outputs`; grad_outputs: the loss's gradient at the outputs, [N, out].
+    """
+    padded_grad = np.zeros((len(inputs), padded(sizes[-1])), np.float32)
+    padded_grad[:, : sizes[-1]] = grad_outputs
+    gradient = np.zeros_like(parameters)
+    back, room = transposed(parameters, sizes), np.empty_like(activations)
+    backward(inputs, activations, padded_grad, back, sizes, gradient, room)
     return gradient
 
 
 @kernel
-def forward(observation, parameters, sizes):
-    """Output of a tanh network for one observation, [sizes[0]]; float32 [sizes[-1]]."""
-    activation = observation
-    start = 0
-    for layer in range(len(sizes) - 1):
-        inputs, outputs = sizes[layer], sizes[layer + 1]
-        biases = start + inputs * outputs
-        weights = parameters[start:biases].reshape(inputs, outputs)
-        start = biases + outputs
-        result = parameters[biases:start].copy()
-        # Inputs outside, outputs inside: the inner loop is a vector operation without reduction.
-        for i in range(inputs):
-            value, row = activation[i], weights[i]
-            for j in range(len(result)):
-                result[j] += value * row[j]
-        if layer < len(sizes) - 2:
-            for j in range(len(result)):
-                result[j] = tanh(result[j])
-        activation = result
-    return activation
+def orthonormal(matrix):
+    """Orthonormal columns that span what the columns of `matrix` do, float64 [M, N], M ≥ N.
+
+    Gram and Schmidt's, each column twice for the sake of rounding. Of a Gaussian matrix it is
+    uniform over all that are possible.
+    """
+    result = matrix.copy()
+    for j in range(result.shape[1]):
+        column = result[:, j].copy()
+        for before in range(2 * j):
+            other = result[:, before % j].copy()
+            along = dot(other, column)
+            for i in range(len(column)):
+                column[i] -= along * other[i]
+        result[:, j] = column / math.sqrt(dot(column, column))
+    return result
+
+
+@kernel
+def shuffled(draws):
+    """Permutations of N, int64 [K, N], by Fisher and Yates, from draws in [0, 1), [K, N].
+
+    The k-th is uniform if the draws are; a draw of almost 1 leaves a place as it is.
+    """
+    order = np.empty(draws.shape, np.int64)
+    for k in range(len(draws)):
+        for n in range(draws.shape[1]):
+            order[k, n] = n
+        for n in range(draws.shape[1] - 1, 0, -1):
+            other = min(int(draws[k, n] * (n + 1)), n)
+            order[k, n], order[k, other] = order[k, other], order[k, n]
+    return order
 
 
 @kernel
@@ -123,154 +178,139 @@ def log_sum_exp(logits):
     largest = logits[0]
     for logit in logits:
         largest = max(largest, logit)
-    total = np.float32(0.0)
+    total = f32(0)
     for logit in logits:
-        total += math.exp(logit - largest)
-    return largest + math.log(total)
+        total += exp(logit - largest)
+    return largest + log(total)
 
 
 @kernel
-def categorical_log_probs(logits, actions):
-    """log π(a|s), [N], of a softmax policy; logits: [N, actions], actions: int64 [N]."""
-    result = np.empty(len(logits), logits.dtype)
-    for n in range(len(logits)):
-        result[n] = logits[n, actions[n]] - log_sum_exp(logits[n])
-    return result
+def log_probs(outputs, log_std, actions, result):
+    """Fill in log π(a|s), float32 [N]: a softmax policy's, or a diagonal Gaussian's.
 
-
-@kernel
-def categorical_grad(logits, actions, weights, entropy_weight):
-    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at the logits.
-
-    logits: [N, actions]; actions: int64 [N]; weights: [N]. Returns an array like `logits`, and
-    Σ_n H(π(·|s_n)).
+    outputs: the network's, [N, ≥ actions]: logits or means; log_std: [actions], empty for Discrete
+    actions; actions: int64 [N] or float32 [N, actions].
     """
-    grad = np.empty_like(logits)
-    total_entropy = 0.0
-    for n in range(len(logits)):
-        log_total = log_sum_exp(logits[n])
+    if actions.ndim == 1:
+        for n in range(len(actions)):
+            result[n] = outputs[n, actions[n]] - log_sum_exp(outputs[n])
+    else:
+        for n in range(len(actions)):
+            total = f32(0)
+            for j in range(len(log_std)):
+                deviation = (actions[n, j] - outputs[n, j]) * exp(-log_std[j])
+                total -= f32(0.5) * deviation * deviation + log_std[j] + f32(HALF_LOG_TAU)
+            result[n] = total
+
+
+@kernel
+def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad, grad_log_std, sums):
+    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at outputs and log_std.
+
+    weights: float32 [N]; outputs, log_std, actions: as in `log_probs`. Fills in grad, like outputs,
+    and adds to grad_log_std, like log_std, and to sums[2] the entropies H.
+    """
+    entropy_weight = f32(entropy_weight)
+    if actions.ndim == 1:
+        for n in range(len(actions)):
+            logits = outputs[n]
+            log_total, entropy = log_sum_exp(logits), f32(0)
+            for j in range(len(logits)):
+                log_prob = logits[j] - log_total
+                grad[n, j] = exp(log_prob)
+                entropy -= grad[n, j] * log_prob
+            sums[2] += entropy
+            for j in range(len(logits)):
+                log_prob = logits[j] - log_total
+                grad[n, j] *= -(weights[n] + entropy_weight * (log_prob + entropy))
+            grad[n, actions[n]] += weights[n]
+    else:
         entropy = 0.0
-        for j in range(logits.shape[1]):
-            log_prob = logits[n, j] - log_total
-            entropy -= math.exp(log_prob) * log_prob
-        total_entropy += entropy
-        for j in range(logits.shape[1]):
-            log_prob = logits[n, j] - log_total
-            prob = math.exp(log_prob)
-            grad[n, j] = -prob * (weights[n] + entropy_weight * (log_prob + entropy))
-        grad[n, actions[n]] += weights[n]
-    return grad, total_entropy
-
-
-@kernel
-def gaussian_log_probs(means, log_std, actions):
-    """log π(a|s) of a diagonal Gaussian policy, [N]; means and actions: [N, actions]."""
-    inverse_std = np.exp(-log_std)
-    constant = log_std.sum() + 0.5 * math.log(2 * math.pi) * len(log_std)
-    result = np.empty(len(means), means.dtype)
-    for n in range(len(means)):
-        squares = 0.0
         for j in range(len(log_std)):
-            squares += ((actions[n, j] - means[n, j]) * inverse_std[j]) ** 2
-        result[n] = -0.5 * squares - constant
-    return result
+            entropy += log_std[j] + f32(HALF_LOG_TAU + 0.5)
+            inverse_std = exp(-log_std[j])
+            for n in range(len(actions)):
+                deviation = (actions[n, j] - outputs[n, j]) * inverse_std
+                grad[n, j] = weights[n] * deviation * inverse_std
+                grad_log_std[j] += weights[n] * (deviation * deviation - f32(1)) + entropy_weight
+        for _ in range(len(actions)):
+            sums[2] += entropy
 
 
 @kernel
-def gaussian_grads(means, log_std, actions, weights, entropy_weight):
-    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at the means and log_std.
-
-    means and actions: [N, actions]; weights: [N]. Returns arrays like `means` and `log_std`, and
-    Σ_n H(π(·|s_n)).
-    """
-    inverse_std = np.exp(-log_std)
-    grad = np.empty_like(means)
-    log_std_grad = np.full_like(log_std, entropy_weight * len(means))
-    for n in range(len(means)):
-        for j in range(len(log_std)):
-            deviation = (actions[n, j] - means[n, j]) * inverse_std[j]
-            grad[n, j] = weights[n] * deviation * inverse_std[j]
-            log_std_grad[j] += weights[n] * (deviation * deviation - 1)
-    entropy = log_std.sum() + 0.5 * (1 + math.log(2 * math.pi)) * len(log_std)
-    return grad, log_std_grad, entropy * len(means)
-
-
-@kernel
-def surrogate_weights(log_probs, old_log_probs, advantages, clip):
+def surrogate_weights(log_probs, old_log_probs, advantages, clip, scale, weights, sums):
     """What the gradient of PPO's clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
 
     The surrogate min(rA, clip(r)A), with ratio r, is flat where the ratio is already past the bound
-    that the advantage pushes it to; elsewhere its gradient is r A ∇ log π.
+    that the advantage pushes it to; elsewhere its gradient is r A ∇ log π, here times `scale`.
 
-    Returns also the sums over n of r - 1 - log r, whose mean estimates the KL divergence from the
-    policy that acted (Schulman 2020), and of whether r is outside the bounds.
+    Adds to sums, float64 [3], r - 1 - log r, whose mean estimates the KL divergence from the
+    policy that acted (Schulman 2020), and whether r is outside the bounds; the third is for the
+    entropy.
     """
-    weights = np.zeros(len(log_probs), np.float32)
-    divergence, outside = 0.0, 0
+    scale = f32(scale)
     for n in range(len(weights)):
         log_ratio = log_probs[n] - old_log_probs[n]
-        ratio, advantage = math.exp(log_ratio), advantages[n]
+        ratio, advantage = exp(log_ratio), advantages[n]
         flat = ratio > 1 + clip if advantage > 0 else ratio < 1 - clip
-        if not flat:
-            weights[n] = ratio * advantage
-        divergence += ratio - 1 - log_ratio
-        outside += abs(ratio - 1) > clip
-    return weights, divergence, outside
+        weights[n] = f32(0) if flat else scale * ratio * advantage
+        sums[0] += ratio - f32(1) - log_ratio
+        sums[1] += abs(ratio - 1) > clip
 
 
-@njit(cache=True)
-def normalise(observation, mean, inverse_std, clip):
-    """(observation - mean) / std, clipped to ±clip; float32 [size]."""
-    result = np.empty(observation.shape[0], np.float32)
-    for i in range(observation.shape[0]):
-        value = (observation[i] - mean[i]) * inverse_std[i]
-        result[i] = min(max(value, -clip), clip)
+@kernel
+def normalise(observation, mean, inverse_std, clip, result):
+    """Fill in, and return, (observation - mean) / std, clipped to ±clip; float32 [size]."""
+    for i in range(len(observation)):
+        result[i] = min(max((observation[i] - mean[i]) * inverse_std[i], -clip), clip)
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sample_categorical(logits, uniform):
     """Sample a categorical action by inverting its distribution function at `uniform` in [0, 1).
 
-    Returns (action from 0, log-probability as float32).
+    Returns (action from 0, log-probability, float32).
     """
-    largest = logits.max()
-    total = np.float32(0.0)
-    for i in range(logits.shape[0]):
-        total += math.exp(logits[i] - largest)
+    log_total = log_sum_exp(logits)
     cumulative = 0.0
-    action = logits.shape[0] - 1  # stays if rounding leaves the sum below `uniform`
-    for i in range(logits.shape[0]):
-        cumulative += math.exp(logits[i] - largest) / total
+    action = len(logits) - 1  # stays if rounding leaves the sum below `uniform`
+    for i in range(len(logits)):
+        cumulative += exp(logits[i] - log_total)
         if uniform < cumulative:
             action = i
             break
-    return action, np.float32(logits[action] - largest - math.log(total))
+    return action, logits[action] - log_total
 
 
-@njit(cache=True)
+@kernel
 def sample_gaussian(means, log_std, normal):
     """Sample a diagonal Gaussian action, means + exp(log_std) · normal; `normal`: [actions].
 
-    Returns (action float32 [actions], not clipped to the bounds; log-probability as float32).
+    Returns (action float32 [actions], not clipped to the bounds; log-probability, float32).
     """
-    action = np.empty(means.shape[0], np.float32)
-    log_prob = 0.0
-    for i in range(means.shape[0]):
-        action[i] = means[i] + math.exp(log_std[i]) * normal[i]
-        log_prob -= 0.5 * normal[i] * normal[i] + log_std[i] + 0.5 * math.log(2 * math.pi)
-    return action, np.float32(log_prob)
+    action = np.empty(len(log_std), np.float32)
+    log_prob = np.empty(1, np.float32)
+    for i in range(len(log_std)):
+        action[i] = means[i] + exp(log_std[i]) * f32(normal[i])
+    log_probs(means.reshape(1, -1), log_std, action.reshape(1, -1), log_prob)
+    return action, log_prob[0]
 
 
-@njit(cache=True, error_model="numpy")
-def act_discrete(observation, mean, inverse_std, clip, parameters, sizes, uniform):
-    """`sample_categorical` from the network's logits for one observation, not yet normalised."""
-    logits = forward(normalise(observation, mean, inverse_std, clip), parameters, sizes)
-    return sample_categorical(logits, uniform)
+@kernel
+def act_discrete(observation, policy, uniform):
+    """`sample_categorical` from the network's logits for one observation, not yet normalised.
+
+    policy: a `CompiledActing`.
+    """
+    normalise(observation, policy.mean, policy.inverse_std, policy.clip, policy.seen[0])
+    outputs = forward(policy.seen, policy.parameters, policy.sizes, policy.activations)
+    return sample_categorical(outputs[0, : policy.sizes[-1]], uniform)
 
 
-@njit(cache=True)
-def act_box(observation, mean, inverse_std, clip, parameters, sizes, log_std, normal):
-    """`sample_gaussian` around the network's means for one observation, not yet normalised."""
-    means = forward(normalise(observation, mean, inverse_std, clip), parameters, sizes)
-    return sample_gaussian(means, log_std, normal)
+@kernel
+def act_box(observation, policy, normal):
+    """`sample_gaussian` around the network's means; arguments as in `act_discrete`."""
+    normalise(observation, policy.mean, policy.inverse_std, policy.clip, policy.seen[0])
+    outputs = forward(policy.seen, policy.parameters, policy.sizes, policy.activations)
+    return sample_gaussian(outputs[0, : policy.sizes[-1]], policy.log_std, normal)

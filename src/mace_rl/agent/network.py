@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from mace_rl.agent import kernels
+from mace_rl.agent.products import padded
 from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.plugins import make
 from mace_rl.config.section import ConfigError
@@ -91,27 +92,25 @@ class TorchNetwork:
 class CompiledMLP:
     """The tanh network of `mlp` in compiled code.
 
-    `parameters` is for each layer the weights, [in, out] row by row, then the biases, [out].
+    `parameters` are laid out as in `kernels`, with zeros between them.
     """
 
     def __init__(self, module: torch.nn.Sequential) -> None:
         shapes = [layer.weight.shape for layer in module if isinstance(layer, torch.nn.Linear)]
         self.sizes = np.array([shapes[0][1], *(shape[0] for shape in shapes)])
-        count = sum(inputs * outputs + outputs for outputs, inputs in shapes)
-        self.parameters = np.empty(count, np.float32)
+        count = sum((inputs + 1) * padded(outputs) for outputs, inputs in shapes)
+        self.parameters = np.zeros(count, np.float32)
         self.load_module_state(module.state_dict())
 
     def forward(self, inputs: np.ndarray) -> Trace:
         """See `Network`."""
-        inputs = np.ascontiguousarray(inputs, self.parameters.dtype)
-        shapes = [(len(inputs), size) for size in self.sizes.tolist()[1:]]
-        activations = (inputs, *(np.empty(shape, inputs.dtype) for shape in shapes))
-        kernels.network_outputs(activations, self.parameters, self.sizes)
-        return Trace(activations[-1], activations)
+        inputs = np.ascontiguousarray(inputs, np.float32)
+        outputs, activations = kernels.network_outputs(inputs, self.parameters, self.sizes)
+        return Trace(outputs, (inputs, activations))
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
         """See `Network`."""
-        return kernels.network_gradient(trace.saved, grad_outputs, self.parameters, self.sizes)
+        return kernels.network_gradient(*trace.saved, self.parameters, grad_outputs, self.sizes)
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`."""
@@ -122,9 +121,11 @@ class CompiledMLP:
         """Views of a vector like `parameters`: each layer's weights, [in, out], and biases."""
         views, start = [], 0
         for inputs, outputs in pairwise(self.sizes.tolist()):
-            end = start + inputs * outputs
-            views.append((flat[start:end].reshape(inputs, outputs), flat[end : end + outputs]))
-            start = end + outputs
+            width = padded(outputs)
+            end = start + (inputs + 1) * width
+            layer = flat[start:end].reshape(inputs + 1, width)[:, :outputs]
+            views.append((layer[:-1], layer[-1]))
+            start = end
         return views
 
     def module(self) -> torch.nn.Sequential:
@@ -223,6 +224,5 @@ def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
 def orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
     """A random matrix with orthonormal rows or columns (Saxe et al. 2014)."""
     rows, columns = max(shape), min(shape)
-    basis, triangle = np.linalg.qr(generator.standard_normal((rows, columns)))
-    basis *= np.sign(np.diag(triangle))  # else not uniform over the orthogonal matrices
+    basis = kernels.orthonormal(generator.standard_normal((rows, columns)))
     return basis if shape == (rows, columns) else basis.T

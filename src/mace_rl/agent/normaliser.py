@@ -1,10 +1,12 @@
 """Running mean and standard deviation of observations."""
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
+
+from mace_rl.agent.kernels import kernel, normalise
 
 
 class RunningNormaliser:
@@ -17,28 +19,20 @@ class RunningNormaliser:
         self.count = 0
         self.mean = np.zeros(size)
         self.sum_of_squares = np.zeros(size)  # of deviations from the mean
+        self.std = np.ones(size)  # standard deviation; 1 where nothing has varied yet
+        self.varied = np.zeros(size, np.bool_)  # whether each dimension has, beyond rounding
 
     def update(self, observations: np.ndarray) -> None:
         """Take in `observations`, [N, size]."""
-        self.mean, self.sum_of_squares = updated(
-            observations, self.count, self.mean, self.sum_of_squares
+        update(
+            *(observations, self.count, self.mean, self.sum_of_squares),
+            *(self.std, self.varied),
         )
         self.count += len(observations)
 
-    @property
-    def std(self) -> np.ndarray:
-        """Standard deviation, [size]; 1 where nothing has varied yet."""
-        std = np.sqrt(self.sum_of_squares / max(self.count, 1))
-        return np.where(self.varied, std, 1.0)
-
-    @property
-    def varied(self) -> np.ndarray:
-        """Whether each dimension has varied, beyond rounding, bool [size]."""
-        return np.sqrt(self.sum_of_squares / max(self.count, 1)) > 1e-8
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """(observations - mean) / std as float32, [..., size]."""
-        return ((observations - self.mean) / self.std).astype(np.float32)
+    def __call__(self, observations: np.ndarray, bound: float = math.inf) -> np.ndarray:
+        """(observations - mean) / std, clipped to ±bound; float32 [N, size]."""
+        return standardised(observations, self.mean, self.std, bound)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""
@@ -51,28 +45,42 @@ class RunningNormaliser:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.count = state["count"]
-        self.mean = state["mean"].numpy().copy()
-        self.sum_of_squares = state["sum_of_squares"].numpy().copy()
+        self.mean[:] = state["mean"].numpy()
+        self.sum_of_squares[:] = state["sum_of_squares"].numpy()
+        spread(self.count, self.sum_of_squares, self.std, self.varied)
 
 
-@njit(cache=True, error_model="numpy")
-def updated(
-    batch: np.ndarray, count: int, mean: np.ndarray, sum_of_squares: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and sum of squared deviations, float64 [size], of `count` observations and a `batch`.
-
-    batch: [N, size]. A compiled loop since an episode of 30 steps is less work than NumPy's calls.
-    """
-    mean, sum_of_squares = mean.copy(), sum_of_squares.copy()
+@kernel
+def update(batch, count, mean, sum_of_squares, std, varied):
+    """Take a `batch`, [N, size], into what `count` observations have left; see the class."""
     share = len(batch) / (count + len(batch))
     for i in range(len(mean)):
         batch_mean = 0.0
-        for value in batch[:, i]:
-            batch_mean += value
+        for n in range(len(batch)):
+            batch_mean += batch[n, i]
         batch_mean /= len(batch)
-        for value in batch[:, i]:
-            sum_of_squares[i] += (value - batch_mean) ** 2
+        for n in range(len(batch)):
+            sum_of_squares[i] += (batch[n, i] - batch_mean) ** 2
         difference = batch_mean - mean[i]
         mean[i] += difference * share
         sum_of_squares[i] += difference**2 * count * share
-    return mean, sum_of_squares
+    spread(count + len(batch), sum_of_squares, std, varied)
+
+
+@kernel
+def spread(count, sum_of_squares, std, varied):
+    """Fill in the standard deviation, and where there is one."""
+    for i in range(len(std)):
+        deviation = math.sqrt(sum_of_squares[i] / max(count, 1))
+        varied[i] = deviation > 1e-8
+        std[i] = deviation if varied[i] else 1.0
+
+
+@kernel
+def standardised(observations, mean, std, bound):
+    """`normalise` of each row, float32 [N, size], as acting does it with the same mean and std."""
+    result = np.empty(observations.shape, np.float32)
+    centre, inverse = mean.astype(np.float32), (1 / std).astype(np.float32)
+    for n in range(len(observations)):
+        normalise(observations[n], centre, inverse, np.float32(bound), result[n])
+    return result

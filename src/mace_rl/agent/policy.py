@@ -29,15 +29,16 @@ class CompiledActing(NamedTuple):
     mean: np.ndarray  # float32 [observation], subtracted from observations
     inverse_std: np.ndarray  # float32 [observation]
     clip: np.float32  # bound of normalised observations
-    parameters: np.ndarray  # float32, see kernels.forward
+    parameters: np.ndarray  # float32, see kernels
     sizes: np.ndarray  # int64 [layers + 1]
-    log_std: np.ndarray | None  # float32 [actions]; None for Discrete actions
+    log_std: np.ndarray  # float32 [actions]; empty for Discrete actions
+    seen: np.ndarray  # overwritten, like the next, see kernels.act_discrete
+    activations: np.ndarray
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """See `ActingPolicy`."""
-        if self.log_std is None:
-            return kernels.act_discrete(observation, *self[:5], noise)
-        return kernels.act_box(observation, *self, noise)
+        sample = kernels.act_box if len(self.log_std) else kernels.act_discrete
+        return sample(observation, self, noise)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class NetworkActing:
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """See `ActingPolicy`."""
-        seen = kernels.normalise(observation, self.mean, self.inverse_std, self.clip)
+        seen = np.empty_like(self.mean)
+        kernels.normalise(observation, self.mean, self.inverse_std, self.clip, seen)
         with torch.no_grad():
             outputs = self.policy.network.forward(seen[None]).outputs[0]
         if self.policy.discrete:
@@ -87,9 +89,9 @@ class Policy:
 
         actions: int64 [N] or float32 [N, actions].
         """
-        if self.discrete:
-            return kernels.categorical_log_probs(outputs, actions)
-        return kernels.gaussian_log_probs(outputs, self.log_std, actions)
+        result = np.empty(len(outputs), np.float32)
+        kernels.log_probs(outputs, self.log_std, actions, result)
+        return result
 
     def gradient(
         self,
@@ -97,21 +99,22 @@ class Policy:
         actions: np.ndarray,
         weights: np.ndarray,
         entropy_weight: float = 0.0,
-    ) -> tuple[np.ndarray, float]:
-        """∇_θ Σ_t (w_t log π(a_t|s_t) + entropy_weight · H(π(·|s_t))), float32 [n], and Σ_t H.
+        sums: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """∇_θ Σ_t (w_t log π(a_t|s_t) + entropy_weight · H(π(·|s_t))), float32 [n].
 
-        trace: from `forward`; actions: as in `log_probs`; weights: float32 [N].
+        trace: from `forward`; actions: as in `log_probs`; weights: float32 [N]. To sums[2] the
+        entropies are added.
         """
-        if self.discrete:
-            grad_outputs, entropy = kernels.categorical_grad(
-                trace.outputs, actions, weights, entropy_weight
-            )
-            return self.network.backward(trace, grad_outputs), entropy
-        grad_outputs, grad_log_std, entropy = kernels.gaussian_grads(
-            trace.outputs, self.log_std, actions, weights, entropy_weight
+        sums = np.zeros(3) if sums is None else sums
+        grad_outputs, gradient = np.empty_like(trace.outputs), np.zeros_like(self.parameters)
+        count = len(gradient) - len(self.log_std)
+        kernels.log_prob_gradient(
+            *(trace.outputs, self.log_std, actions, weights, entropy_weight),
+            *(grad_outputs, gradient[count:], sums),
         )
-        gradient = self.network.backward(trace, grad_outputs)
-        return np.concatenate([gradient, grad_log_std]), entropy
+        gradient[:count] = self.network.backward(trace, grad_outputs)
+        return gradient
 
     def for_acting(self, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:
         """The policy with observation normalisation in front of it.
@@ -119,9 +122,11 @@ class Policy:
         Its weights follow later updates; `mean` and `std` stay as they are now.
         """
         normalisation = mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip)
-        if isinstance(self.network, CompiledMLP):
-            log_std = None if self.discrete else self.log_std
-            return CompiledActing(
-                *normalisation, self.network.parameters, self.network.sizes, log_std
-            )
-        return NetworkActing(self, *normalisation)
+        if not isinstance(self.network, CompiledMLP):
+            return NetworkActing(self, *normalisation)
+        sizes = self.network.sizes
+        return CompiledActing(
+            *(*normalisation, self.network.parameters, sizes, self.log_std),
+            np.empty((1, sizes[0]), np.float32),
+            kernels.room_for(1, sizes),
+        )

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -11,16 +11,13 @@ import torch
 from mace_rl.agent import kernels
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.advantages import generalised_advantages
-from mace_rl.agent.network import Network
+from mace_rl.agent.learning import improve_policy, improve_values
+from mace_rl.agent.network import CompiledMLP, Network
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
 from mace_rl.config.agent import PPOConfig
 
-# Steps that go through a network at once in an update. Arrays for many more would not fit into the
-# processor's cache, and the system takes back their memory after each use: a quarter more time for
-# 2048 steps.
-BLOCK = 512
 TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 
@@ -48,11 +45,18 @@ class Batch:
             {kind: returns[index] for kind, returns in self.returns.items()},
         )
 
-    def blocks(self) -> Iterator["Batch"]:
-        """All steps in order, `BLOCK` at a time."""
-        if len(self) <= BLOCK:
-            return iter([self])
-        return (self[start : start + BLOCK] for start in range(0, len(self), BLOCK))
+
+class Minibatches(NamedTuple):
+    """Which steps of a batch each epoch learns from, and in which order."""
+
+    epochs: np.ndarray  # int64 [K, N], permutations of the steps
+    ends: np.ndarray  # int64 [M], where each minibatch of an epoch ends
+
+    def of(self, batch: Batch) -> Iterator[Batch]:
+        """The minibatches, epoch after epoch."""
+        for order in self.epochs:
+            for chosen in np.split(order, self.ends[:-1]):
+                yield batch[chosen]
 
 
 @dataclass
@@ -76,8 +80,8 @@ class Critic(Protocol):
     def values(self, observations: np.ndarray) -> np.ndarray:
         """V of each state, float64 [N]; observations: normalised, float32 [N, observation]."""
 
-    def learn(self, batch: Batch) -> float:
-        """Learn from one minibatch of one epoch; returns the gradient's norm, 0 without one."""
+    def learn(self, batch: Batch, minibatches: Minibatches) -> float:
+        """Learn in all epochs of an update; returns the last gradient's norm, 0 without one."""
 
     def remember(self, batch: Batch) -> None:
         """Take in all steps of an update, once, after its epochs."""
@@ -105,20 +109,21 @@ class NetworkCritic:
         """See `Critic`."""
         return self.network.forward(observations).outputs[:, 0].astype(np.float64)
 
-    def learn(self, batch: Batch) -> float:
+    def learn(self, batch: Batch, minibatches: Minibatches) -> float:
         """See `Critic`."""
-        return self.optimiser.step(self.gradient(batch))
+        if isinstance(self.network, CompiledMLP):
+            observations, returns = batch.observations, batch.returns[self.kind]
+            sizes, optimiser = self.network.sizes, self.optimiser.state
+            return improve_values(observations, returns, *minibatches, sizes, optimiser)
+        for steps in minibatches.of(batch):
+            norm = self.optimiser.step(self.gradient(steps))
+        return norm
 
     def gradient(self, batch: Batch) -> np.ndarray:
         """Gradient of the mean squared error of V(s) against the λ-returns, float32 [n]."""
-        total: np.ndarray | None = None
-        for steps in batch.blocks():
-            trace = self.network.forward(steps.observations)
-            errors = trace.outputs - steps.returns[self.kind][:, None]
-            gradient = self.network.backward(trace, 2 * errors)
-            total = gradient if total is None else total + gradient
-        assert total is not None  # a batch has steps
-        return total / np.float32(len(batch))
+        trace = self.network.forward(batch.observations)
+        errors = trace.outputs - batch.returns[self.kind][:, None]
+        return self.network.backward(trace, np.float32(2 / len(batch)) * errors)
 
     def remember(self, batch: Batch) -> None:
         """See `Critic`: everything is learnt in the epochs."""
@@ -163,7 +168,7 @@ class PPO:
             if critic.optimiser is not None
         }
         self.normaliser = normaliser
-        self.minibatches = generator
+        self.generator = generator
         smallest = {"extrinsic": (1.0, config.smallest_advantage)}
         self.reward_scales: dict[str, RewardScale] = {}
         self.advantage_scales: dict[str, AdvantageScale] = {}
@@ -176,7 +181,7 @@ class PPO:
         """What the networks see of `observations`, float32 [N, observation]."""
         if not self.config.normalise_observations:
             return observations
-        return np.clip(self.normaliser(observations), -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        return self.normaliser(observations, OBSERVATION_CLIP)
 
     def normalisation(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Mean and standard deviation of observations, [observation], and the normalised's bound.
@@ -222,44 +227,52 @@ class PPO:
         return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
 
     def update(self, batch: Batch) -> Update:
-        """K epochs over `batch`."""
-        for _ in range(self.config.epochs):
-            update = Update({})
-            for minibatch in self._minibatches(batch):
-                share = len(minibatch) / len(batch)
-                gradient, kl, clipped, entropy = self.actor_gradient(minibatch)
-                update.approximate_kl += share * kl
-                update.clip_fraction += share * clipped
-                update.entropy += share * entropy
-                update.gradient_norms["actor"] = self.optimisers["actor"].step(gradient)
-                for kind, critic in self.critics.items():
-                    update.gradient_norms[kind] = critic.learn(minibatch)
-        for critic in self.critics.values():
-            critic.remember(batch)
-        return update
+        """K epochs over `batch`.
 
-    def actor_gradient(self, batch: Batch) -> tuple[np.ndarray, float, float, float]:
+        Actor and critics share no weights, so each goes through all epochs before the next one.
+        """
+        minibatches = self.minibatches_of(batch)
+        norm, sums = self.improve_policy(batch, minibatches)
+        norms = {"actor": norm}
+        for kind, critic in self.critics.items():
+            norms[kind] = critic.learn(batch, minibatches)
+            critic.remember(batch)
+        return Update(norms, *(sums / len(batch)).tolist())
+
+    def improve_policy(self, batch: Batch, minibatches: Minibatches) -> tuple[float, np.ndarray]:
+        """Descend the surrogate in all epochs.
+
+        Returns the last minibatch's gradient norm, and sums over the steps of the last epoch: of
+        what `Update` has the means of.
+        """
+        network, optimiser = self.policy.network, self.optimisers["actor"]
+        if isinstance(network, CompiledMLP):
+            return improve_policy(
+                *(batch.observations, batch.actions, batch.log_probs, batch.advantages),
+                *(*minibatches, network.sizes, len(network.parameters)),
+                *(self.config.clip, self.config.entropy_coefficient, optimiser.state),
+            )
+        for done, steps in enumerate(minibatches.of(batch)):
+            if done % len(minibatches.ends) == 0:  # an epoch begins
+                sums = np.zeros(3)
+            norm = optimiser.step(self.actor_gradient(steps, sums))
+        return norm, sums
+
+    def actor_gradient(self, batch: Batch, sums: np.ndarray) -> np.ndarray:
         """∇_θ of the negated clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
 
-        Also the batch's approximate KL divergence, clip fraction and entropy, as in `Update`.
+        sums: float64 [3], see `improve_policy`; the batch's are added.
         """
-        total: np.ndarray | None = None
-        divergence = outside = entropy = 0.0
-        for steps in batch.blocks():
-            trace = self.policy.forward(steps.observations)
-            log_probs = self.policy.log_probs(trace.outputs, steps.actions)
-            weights, *sums = kernels.surrogate_weights(
-                log_probs, steps.log_probs, steps.advantages, self.config.clip
-            )
-            gradient, uncertainty = self.policy.gradient(
-                trace, steps.actions, weights, self.config.entropy_coefficient
-            )
-            total = gradient if total is None else total + gradient
-            divergence, outside = divergence + sums[0], outside + sums[1]
-            entropy += uncertainty
-        assert total is not None  # a batch has steps
-        count = len(batch)
-        return -(total / np.float32(count)), divergence / count, outside / count, entropy / count
+        share = -1 / len(batch)
+        trace = self.policy.forward(batch.observations)
+        log_probs = self.policy.log_probs(trace.outputs, batch.actions)
+        weights = np.empty_like(log_probs)
+        kernels.surrogate_weights(
+            *(log_probs, batch.log_probs, batch.advantages, self.config.clip, share),
+            *(weights, sums),
+        )
+        entropy_weight = share * self.config.entropy_coefficient
+        return self.policy.gradient(trace, batch.actions, weights, entropy_weight, sums)
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
@@ -267,20 +280,20 @@ class PPO:
         """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
         trace = self.policy.forward(observations)
         return [
-            self.policy.gradient(trace, actions, (item / len(item)).astype(trace.outputs.dtype))[0]
+            self.policy.gradient(trace, actions, (item / len(item)).astype(np.float32))
             for item in advantages
         ]
 
-    def _minibatches(self, batch: Batch) -> Iterator[Batch]:
-        """The minibatches of one epoch; the whole batch in order if none are asked for."""
-        if self.config.minibatch_size is None:
-            yield batch
-            return
-        order = self.minibatches.permutation(len(batch))
+    def minibatches_of(self, batch: Batch) -> Minibatches:
+        """The minibatches of an update; the whole batch in order if it is one."""
+        size, count = self.config.minibatch_size, len(batch)
+        shape = self.config.epochs, count
+        if size is None or count <= size:
+            return Minibatches(kernels.shuffled(np.ones(shape)), np.array([count]))
         # As even as can be: a last one of two samples would step as far as one of 128.
-        count = math.ceil(len(batch) / self.config.minibatch_size)
-        for chosen in np.array_split(order, count):
-            yield batch[chosen]
+        parts = math.ceil(count / size)
+        ends = np.arange(1, parts + 1) * count // parts
+        return Minibatches(kernels.shuffled(self.generator.random(shape)), ends)
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, normaliser and generator."""
@@ -288,7 +301,7 @@ class PPO:
             "actor": self.optimisers["actor"].state_dict(),
             "critics": {kind: critic.state_dict() for kind, critic in self.critics.items()},
             "normaliser": self.normaliser.state_dict(),
-            "minibatches": self.minibatches.bit_generator.state,
+            "minibatches": self.generator.bit_generator.state,
             "scales": [
                 {kind: scale.state_dict() for kind, scale in scales.items()}
                 for scales in (self.reward_scales, self.advantage_scales)
@@ -301,7 +314,7 @@ class PPO:
         for kind, critic in self.critics.items():
             critic.load_state_dict(state["critics"][kind])
         self.normaliser.load_state_dict(state["normaliser"])
-        self.minibatches.bit_generator.state = state["minibatches"]
+        self.generator.bit_generator.state = state["minibatches"]
         scales: list[Mapping[str, RewardScale | AdvantageScale]]
         scales = [self.reward_scales, self.advantage_scales]
         for group, saved in zip(scales, state["scales"], strict=True):

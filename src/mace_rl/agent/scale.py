@@ -4,9 +4,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mace_rl.agent.kernels import kernel
 from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.agent.products import dot
 
 
 class RewardScale:
@@ -51,7 +52,7 @@ class AdvantageScale:
     def update(self, advantages: np.ndarray) -> None:
         """Take in one episode's advantages, [T]."""
         self.count += len(advantages)
-        self.squares += float(advantages @ advantages)
+        self.squares += dot(advantages, advantages)
 
     @property
     def value(self) -> float:
@@ -67,7 +68,7 @@ class AdvantageScale:
         self.count, self.squares = state["count"], state["squares"]
 
 
-@njit(cache=True)
+@kernel
 def discounted_sums(rewards: np.ndarray, discount: float) -> np.ndarray:
     """r_t + γ r_{t-1} + γ² r_{t-2} + … at each step of an episode, float64 [T]."""
     result = np.empty(len(rewards))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mace_rl.agent.advantages import total
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.beta import BanditBeta, RandomBeta
 from mace_rl.environments.rollout import Episode
@@ -73,7 +74,7 @@ class SlidingWindowBandit(BetaController):
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
-        self.returns.append(float(episode.rewards.sum()))
+        self.returns.append(total(episode.rewards))
         self.worst = min(self.worst, self.returns[-1])
         self.best = max(self.best, self.returns[-1])
         self.steps += len(episode)

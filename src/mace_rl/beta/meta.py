@@ -3,7 +3,6 @@
 import math
 from collections import deque
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,13 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 from mace_rl.agent.adam import Adam
-from mace_rl.agent.network import Trace
+from mace_rl.agent.advantages import total
+from mace_rl.agent.elementary import exp, log
+from mace_rl.agent.kernels import kernel
 from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.agent.products import dot
 from mace_rl.beta.controller import BetaController, Effect
-from mace_rl.beta.lstm import meta_network
+from mace_rl.beta.lstm import logit, meta_network
 from mace_rl.beta.progress import Progress
 from mace_rl.config.beta import MetaConfig
 from mace_rl.environments.rollout import Episode
@@ -75,23 +77,29 @@ class MetaAdaptation(BetaController):
         # What the LSTM read for the β of each episode since the last `learn`, and for that of the
         # next; None for the first episode.
         self.sources: deque[np.ndarray | None] = deque([None])
+        self.answer: float | None = None  # β of the next episode, once somebody has asked
         self.judged: list[Judged] = []
+        self.lessons: list[tuple[np.ndarray, float]] = []  # what was read and its credit, to learn
         self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 
     @property
     def beta(self) -> float:
         """See `BetaController`; from the network as it is now."""
-        source = self.sources[-1]
-        return self.initial if source is None else beta_of(self.network.forward(source))
+        if self.answer is None:
+            source = self.sources[-1]
+            trace = None if source is None else self.network.forward([source])
+            self.answer = self.initial if trace is None else logistic(trace.outputs[0])
+        return self.answer
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         beta = self.beta
         self.normaliser.update(episode.observations[:-1])
-        self.progress.update(float(episode.rewards.sum()))
+        self.progress.update(total(episode.rewards))
         if not self.learns:  # nobody will ask what the earlier ones were
             self.sources.clear()
         self.sources.append(self.sequence(episode, bonus, beta))
+        self.answer = None
 
     def sequence(self, episode: Episode, bonus: np.ndarray, beta: float) -> np.ndarray:
         """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
@@ -102,20 +110,13 @@ class MetaAdaptation(BetaController):
         any size fit.
         """
         actions = episode.actions
-        if self.action_count:
+        if actions.ndim == 1:
             actions = np.eye(self.action_count, dtype=np.float32)[actions]
-        states = self.normaliser(episode.observations[:-1]).clip(-STATE_CLIP, STATE_CLIP)
-        seen = np.concatenate([states, actions], axis=1)
-        rewards = np.stack([episode.rewards, bonus], axis=1)
-        length = self.config.max_sequence
-        if length is not None and len(episode) > length:
-            starts = np.linspace(0, len(episode), length, endpoint=False).astype(np.int64)
-            counts = np.diff(starts, append=len(episode))
-            seen = np.add.reduceat(seen, starts) / counts[:, None]
-            rewards = np.add.reduceat(rewards, starts)
-        rewards = np.sign(rewards) * np.log1p(np.abs(rewards))
-        training = np.tile(self.progress.features(beta), (len(rewards), 1))
-        return np.concatenate([seen, rewards, training], axis=1).astype(np.float32)
+        states = self.normaliser(episode.observations[:-1], STATE_CLIP)
+        length = min(self.config.max_sequence or len(episode), len(episode))
+        return read(
+            *(states, actions, episode.rewards, bonus, self.progress.features(beta), length),
+        )
 
     def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
         """See `BetaController`: judge the βs of the last updates, then remember this one's."""
@@ -123,21 +124,20 @@ class MetaAdaptation(BetaController):
         done = [judged for judged in self.judged if judged.updates == self.config.horizon]
         self.judged = self.judged[len(done) :]
         self.judged += [self.judge(self.sources.popleft(), effect) for effect in effects]
-        sources = [judged.source for judged in done if judged.source is not None]
-        if not sources:
+        for judged in done:
+            if judged.source is not None:
+                self.lessons.append((judged.source, self.bounded(judged.credit)))
+        if len(self.lessons) < self.config.learn_every:
             return None
-        credits = [self.bounded(judged.credit) for judged in done if judged.source is not None]
+        sources, credits = zip(*self.lessons, strict=True)
         # Adam descends, so what it gets is minus the mean.
-        gradients = (
-            self.logit_gradient(source, credit, -1 / len(sources))
-            for source, credit in zip(sources, credits, strict=True)
-        )
-        self.optimiser.step(reduce(np.add, gradients))
+        self.optimiser.step(-self.logit_gradient(list(sources), np.array(credits)))
+        self.lessons, self.answer = [], None
         return sum(credits) / len(credits)
 
     def judge(self, source: np.ndarray | None, effect: Effect) -> Judged:
         """The β that the LSTM set for what is in `source` and that had this effect."""
-        length = float(np.linalg.norm(effect.direction))
+        length = math.sqrt(dot(effect.direction, effect.direction))
         direction = effect.direction / np.float32(length) if length > 0 else effect.direction
         return Judged(source, direction, min(1.0, effect.influence))
 
@@ -150,8 +150,8 @@ class MetaAdaptation(BetaController):
             judged.updates += 1
         if not (self.judged and strength > 0):
             return
-        along = [float(gradient @ judged.direction) / strength for judged in self.judged]
-        squares = sum(value**2 for value in along) / len(along)
+        along = [dot(gradient, judged.direction) / strength for judged in self.judged]
+        squares = sum(value * value for value in along) / len(along)
         self.alignments = SCALE_DECAY * self.alignments + squares
         self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
         usual = math.sqrt(self.alignments / self.alignment_weight)
@@ -164,16 +164,15 @@ class MetaAdaptation(BetaController):
         bound = self.config.max_credit
         return min(max(credit / math.sqrt(self.config.horizon), -bound), bound)
 
-    def logit_gradient(self, source: np.ndarray, credit: float, weight: float = 1.0) -> np.ndarray:
-        """`weight` · (credit - prior · (logit - initial logit)) · dlogit/dφ, float32 [n].
+    def logit_gradient(self, sources: list[np.ndarray], credits: np.ndarray) -> np.ndarray:
+        """Mean of (credit - prior · (logit - initial logit)) · dlogit/dφ over B β, float32 [n].
 
         By the logit and not by β, whose derivative β (1 - β) would hold a β near 0 or 1 for ever.
-        source: float32 [T, input]; φ are the parameters, [n].
+        sources: of each β, float32 [T, input]; credits: [B]; φ are the parameters, [n].
         """
-        trace = self.network.forward(source)
-        away = float(trace.outputs[0]) - math.log(self.initial / (1 - self.initial))
-        step = credit - self.config.prior * away
-        return self.network.backward(trace, np.array([weight * step], np.float32))
+        trace = self.network.forward(sources)
+        steps = credits - self.config.prior * (trace.outputs - logit(self.initial))
+        return self.network.backward(trace, (steps / len(sources)).astype(np.float32))
 
     def state_dict(self) -> dict[str, Any]:
         """See `BetaController`."""
@@ -187,6 +186,7 @@ class MetaAdaptation(BetaController):
                 | {"influence": item.influence, "credit": item.credit, "updates": item.updates}
                 for item in self.judged
             ],
+            "lessons": [(as_tensor(source), credit) for source, credit in self.lessons],
             "alignments": [self.alignments, self.alignment_weight],
         }
 
@@ -196,16 +196,55 @@ class MetaAdaptation(BetaController):
         self.normaliser.load_state_dict(state["normaliser"])
         self.progress.load_state_dict(state["progress"])
         self.sources = deque(as_array(source) for source in state["sources"])
+        self.answer = None
         self.judged = [
             Judged(**item | {name: as_array(item[name]) for name in ("source", "direction")})
             for item in state["judged"]
         ]
+        self.lessons = [(source.numpy(), credit) for source, credit in state["lessons"]]
         self.alignments, self.alignment_weight = state["alignments"]
 
 
-def beta_of(trace: Trace) -> float:
-    """β in (0, 1): the logistic function of the network's output, without overflow."""
-    return 0.5 + 0.5 * math.tanh(0.5 * float(trace.outputs[0]))
+@kernel
+def logistic(x: np.float32) -> float:
+    """1 / (1 + e⁻ˣ), float64, which is below 1 as long as x is below 36."""
+    return 1 / (1 + np.float64(exp(-x)))
+
+
+@kernel
+def read(
+    states: np.ndarray,
+    actions: np.ndarray,
+    rewards: np.ndarray,
+    bonus: np.ndarray,
+    training: np.ndarray,
+    length: int,
+) -> np.ndarray:
+    """`MetaAdaptation.sequence` from its parts, [T, …] each but training, in `length` stretches."""
+    seen = states.shape[1] + actions.shape[1]
+    result = np.zeros((length, seen + 2 + len(training)), np.float32)
+    for k in range(length):
+        first, end = k * len(states) // length, (k + 1) * len(states) // length
+        row, reward, novelty = result[k], 0.0, 0.0
+        for t in range(first, end):
+            for i in range(states.shape[1]):
+                row[i] += states[t, i]
+            for i in range(actions.shape[1]):
+                row[states.shape[1] + i] += actions[t, i]
+            reward += rewards[t]
+            novelty += bonus[t]
+        for i in range(seen):
+            row[i] /= np.float32(end - first)
+        row[seen], row[seen + 1] = logarithm(reward), logarithm(novelty)
+        row[seen + 2 :] = training
+    return result
+
+
+@kernel
+def logarithm(x: float) -> np.float32:
+    """sign(x) log(1 + |x|)."""
+    size = log(np.float32(1 + abs(x)))
+    return -size if x < 0 else size
 
 
 def as_tensor(array: np.ndarray | None) -> torch.Tensor | None:

@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from mace_rl.agent.elementary import log
+from mace_rl.beta.lstm import logit
+
 FAST, SLOW = 0.1, 0.02  # weights of the last return in the two moving averages
 IMPROVEMENT = 0.1  # of the returns' standard deviation: less is not progress
 
@@ -44,12 +47,11 @@ class Progress:
         deviations of the return; log(1 + episodes since the best) / 2; the logit of β / 2.
         """
         unit = self.spread or 1.0
-        logit = math.log(max(beta, 1e-6) / max(1 - beta, 1e-6))
         features = (
             (self.fast - self.slow) / unit,
             (self.best - self.fast) / unit,
-            math.log1p(self.stalled) / 2,
-            logit / 2,
+            log(np.float32(1 + self.stalled)) / 2,
+            logit(min(max(beta, 1e-6), 1 - 1e-6)) / 2,
         )
         return np.clip(features, -3, 3)
 

@@ -14,24 +14,24 @@ class ExponentialSchedule(BetaController):
 
     def __init__(self, config: ExponentialBeta) -> None:
         self.config = config
-        self.episodes = 0
+        self.decayed = config.initial
 
     @property
     def beta(self) -> float:
         """β of the next episode."""
-        return max(self.config.floor, self.config.initial * self.config.decay**self.episodes)
+        return max(self.config.floor, self.decayed)
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
-        self.episodes += 1
+        self.decayed *= self.config.decay
 
     def state_dict(self) -> dict[str, Any]:
         """See `BetaController`."""
-        return {"episodes": self.episodes}
+        return {"decayed": self.decayed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `BetaController`."""
-        self.episodes = state["episodes"]
+        self.decayed = state["decayed"]
 
 
 class Constant(BetaController):

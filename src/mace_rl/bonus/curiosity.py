@@ -1,12 +1,12 @@
 """The curiosity bonus: novelty × what the episodic memory says of similar states (paper)."""
 
+import math
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
-from numba import njit
 
+from mace_rl.agent.kernels import kernel
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
@@ -18,7 +18,7 @@ from mace_rl.streams import Streams
 SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relevance(
     similarity: np.ndarray, recalled: np.ndarray, worst: float, best: float
 ) -> np.ndarray:
@@ -84,7 +84,7 @@ class Curiosity(IntrinsicReward):
         if self.memory.neighbours is None:
             return Bonus(new, new, np.ones(len(new)), np.zeros(len(new)))
         recalled, similarity = self.memory.recall(states)
-        relevant = relevance(similarity, recalled[:, -1], self.worst, self.best)
+        relevant = relevance(similarity, recalled, self.worst, self.best)
         return Bonus(new * relevant, new, relevant, similarity)
 
     def scale(self) -> np.ndarray:
@@ -94,7 +94,7 @@ class Curiosity(IntrinsicReward):
         dimension, like independent standardised ones.
         """
         size = len(self.normaliser.mean)
-        return np.full(size, size**-0.5) if self.discrete else self.normaliser.std
+        return np.full(size, 1 / math.sqrt(size)) if self.discrete else self.normaliser.std
 
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
         """Make the episode part of memory and of what is no longer novel.
@@ -112,21 +112,18 @@ class Curiosity(IntrinsicReward):
         # What the memory compares states with until the next episode is remembered.
         if self.memory is not None and len(self.memory) > 0:
             self.memory.lay_out(self.normaliser.mean, self.scale())
-            returns = self.memory.values[: len(self.memory), -1].numpy()
+            returns = self.memory.values[: len(self.memory), -1]
             self.worst, self.best = float(returns.min()), float(returns.max())
 
     def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.
         every = memory.config.write_every
         chosen = np.arange(-self.steps % every, len(episode), every)
-        chosen = np.union1d(chosen, len(episode) - 1)
+        if len(chosen) == 0 or chosen[-1] < len(episode) - 1:
+            chosen = np.append(chosen, len(episode) - 1)
         self.steps += len(episode)
-        memory.write(
-            torch.from_numpy(episode.observations[:-1][chosen]),
-            torch.from_numpy(episode.observations[1:][chosen]),
-            torch.from_numpy(episode.rewards[chosen]),
-            torch.from_numpy(returns[chosen]),
-        )
+        before, after = episode.observations[:-1], episode.observations[1:]
+        memory.write(before[chosen], after[chosen], episode.rewards[chosen], returns[chosen])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""

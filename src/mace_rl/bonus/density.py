@@ -4,13 +4,12 @@
 compiled code; `DensityEstimator` makes a density of either's outputs.
 """
 
-import math
-
 import numpy as np
 import torch
-from numba import njit
 from torch.nn.functional import linear
 
+from mace_rl.agent.elementary import exp
+from mace_rl.agent.kernels import HALF_LOG_TAU, kernel
 from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, Trace, mlp
 
 SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
@@ -73,48 +72,46 @@ class DensityEstimator:
         )
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
-        """Log-density of each row of x, [N, size] → [N]."""
-        outputs = self.network.forward(x).outputs
-        return gaussian_log_probs(x, outputs, self._inverse_std(outputs))
+        """Log-density of each row of x, float32 [N, size] → [N]."""
+        return gaussian_log_probs(x, self.network.forward(x).outputs)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """∇ of the mean log-density of the rows of x, [N, size], with respect to the parameters."""
         trace = self.network.forward(x)
-        grad_outputs = gaussian_grad(x, trace.outputs, self._inverse_std(trace.outputs))
-        return self.network.backward(trace, grad_outputs)
-
-    def _inverse_std(self, outputs: np.ndarray) -> np.ndarray:
-        """1 / σ, [N, size], from the network's outputs, [N, 2 size]: μ, then log σ unbounded."""
-        log_std = outputs[:, outputs.shape[1] // 2 :]
-        return np.exp(-np.maximum(log_std, np.float32(SMALLEST_LOG_STD)))
+        return self.network.backward(trace, gaussian_grad(x, trace.outputs))
 
 
-@njit(cache=True, error_model="numpy")
-def gaussian_log_probs(x: np.ndarray, outputs: np.ndarray, inverse_std: np.ndarray) -> np.ndarray:
-    """Σ_i log N(x_i; μ_i, σ_i) of each row, [N]; arguments as in `gaussian_grad`."""
+@kernel
+def gaussian_log_probs(x: np.ndarray, outputs: np.ndarray) -> np.ndarray:
+    """Σ_i log N(x_i; μ_i, σ_i) of each row, float32 [N]; arguments as in `gaussian_grad`."""
     count, size = x.shape
-    result = np.full(count, -0.5 * math.log(2 * math.pi) * size, x.dtype)
+    result = np.empty(count, np.float32)
     for n in range(count):
+        total = np.float32(-HALF_LOG_TAU * size)
         for i in range(size):
-            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
-            log_std = max(outputs[n, size + i], SMALLEST_LOG_STD)
-            result[n] -= 0.5 * deviation * deviation + log_std
+            log_std = max(outputs[n, size + i], np.float32(SMALLEST_LOG_STD))
+            deviation = (x[n, i] - outputs[n, i]) * exp(-log_std)
+            total -= np.float32(0.5) * deviation * deviation + log_std
+        result[n] = total
     return result
 
 
-@njit(cache=True, error_model="numpy")
-def gaussian_grad(x: np.ndarray, outputs: np.ndarray, inverse_std: np.ndarray) -> np.ndarray:
+@kernel
+def gaussian_grad(x: np.ndarray, outputs: np.ndarray) -> np.ndarray:
     """Gradient of the mean over the rows of Σ_i log N(x_i; μ_i, σ_i) at the outputs, [N, 2 size].
 
-    x: [N, size]; outputs: [N, 2 size], μ and log σ, which has no gradient below its lower bound;
-    inverse_std: [N, size], 1 / σ.
+    x: float32 [N, size]; outputs: float32 [N, 2 size], μ and log σ, which has no gradient below its
+    lower bound.
     """
     count, size = x.shape
     grad = np.empty_like(outputs)
+    share = np.float32(1 / count)
     for n in range(count):
         for i in range(size):
-            deviation = (x[n, i] - outputs[n, i]) * inverse_std[n, i]
-            grad[n, i] = deviation * inverse_std[n, i] / count
             free = outputs[n, size + i] > SMALLEST_LOG_STD
-            grad[n, size + i] = (deviation * deviation - 1) / count if free else 0.0
+            log_std = max(outputs[n, size + i], np.float32(SMALLEST_LOG_STD))
+            inverse_std = exp(-log_std)
+            deviation = (x[n, i] - outputs[n, i]) * inverse_std
+            grad[n, i] = deviation * inverse_std * share
+            grad[n, size + i] = (deviation * deviation - np.float32(1)) * share if free else 0.0
     return grad

@@ -1,5 +1,6 @@
 """Counts of hashed states (Tang et al. 2017), a pseudo-count (Bellemare et al. 2016)."""
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
 
+from mace_rl.agent.kernels import kernel
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.bonus import HashCountsBonus
@@ -43,8 +45,7 @@ class HashCounts(IntrinsicReward):
 
     def codes(self, states: np.ndarray) -> list[int]:
         """φ of each state, [T, observation], as a number whose bits are the signs."""
-        signs = self.normaliser(states) @ self.matrix.T > 0
-        return (signs @ (1 << np.arange(self.config.bits))).tolist()
+        return codes(self.normaliser(states), self.matrix).tolist()
 
     def bonus(self, episode: Episode) -> Bonus:
         """See `IntrinsicReward`."""
@@ -52,7 +53,7 @@ class HashCounts(IntrinsicReward):
         reward = np.empty(len(episode))
         for t, code in enumerate(self.codes(episode.observations[1:])):
             visits[code] += 1
-            reward[t] = (self.counts[code] + visits[code]) ** -0.5
+            reward[t] = 1 / math.sqrt(self.counts[code] + visits[code])
         return Bonus(reward)
 
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
@@ -81,3 +82,17 @@ class HashCounts(IntrinsicReward):
         self.early = state["early"].numpy().copy()
         counts = zip(state["codes"].tolist(), state["counts"].tolist(), strict=True)
         self.counts = Counter(dict(counts))
+
+
+@kernel
+def codes(states: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """For each state, [T, observation], a number whose bits are the signs of matrix · state."""
+    result = np.zeros(len(states), np.int64)
+    for t in range(len(states)):
+        for bit in range(len(matrix)):
+            total = 0.0
+            for i in range(states.shape[1]):
+                total += matrix[bit, i] * states[t, i]
+            if total > 0:
+                result[t] |= 1 << bit
+    return result

@@ -94,7 +94,7 @@ class PredictionError(IntrinsicReward):
 
     def whiten(self, observations: np.ndarray) -> np.ndarray:
         """Observations as the network sees them, float32 [N, observation]."""
-        return np.clip(self.normaliser(observations), -CLIP, CLIP)
+        return self.normaliser(observations, CLIP)
 
     def bonus(self, episode: Episode) -> Bonus:
         """See `IntrinsicReward`."""

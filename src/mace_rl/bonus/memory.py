@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from mace_rl.agent.kernels import kernel
 from mace_rl.config.bonus import MemoryConfig
 from mace_rl.nearest import Neighbours
 
@@ -23,41 +23,40 @@ class EpisodicMemory:
 
     def __init__(self, config: MemoryConfig, key_size: int) -> None:
         self.config = config
-        self.keys = torch.zeros(config.capacity, key_size)
-        self.values = torch.zeros(config.capacity, key_size + 2)
+        self.keys = np.zeros((config.capacity, key_size), np.float32)
+        self.values = np.zeros((config.capacity, key_size + 2), np.float32)
         # For each entry the time of its last reading or writing, and its number among all that were
-        # ever written, from 1; 0 for an empty one.
+        # ever written, from 1; below 0 for an empty one, so that no two are equal.
         self.usage = np.zeros(config.capacity, np.int64)
-        self.number = np.zeros(config.capacity, np.int64)
-        self.time = 0
+        self.number = np.arange(-config.capacity, 0)
+        self.time = self.written = self.stored = 0
         self.read = np.zeros(config.capacity, np.bool_)  # entries, since the last `write`
         self.neighbours: Neighbours | None = None
 
     def __len__(self) -> int:
-        return int(np.count_nonzero(self.usage))
+        return self.stored
 
-    def write(self, keys: Tensor, next_states: Tensor, rewards: Tensor, returns: Tensor) -> None:
+    def write(
+        self, keys: np.ndarray, next_states: np.ndarray, rewards: np.ndarray, returns: np.ndarray
+    ) -> None:
         """Store N experiences over the least recently used entries.
 
         keys, next_states: [N, key]; rewards, returns: [N]. Of more than `capacity` the last ones
         are stored. What was read since the last time counts as used first, all at the same time.
         """
-        if self.read.any():
-            self.time += 1
-            self.usage[self.read] = self.time
-            self.read[:] = False
-        self.time += 1
-        written = [part.numpy()[-self.config.capacity :] for part in (keys, next_states)]
-        outcome = [part.numpy()[-self.config.capacity :] for part in (rewards, returns)]
+        if len(self):
+            use(self.read, self.time + 1, self.usage)
+        self.time += 2
+        kept = min(len(keys), self.config.capacity)
         # A lookup of a long episode reads nearly every entry: of equally used ones the earliest
         # written goes, or entries that are read for ever would never be outdated.
-        count = len(written[0])
-        oldest = np.lexsort((self.number, self.usage))[:count]
-        values = self.values.numpy()
-        self.keys.numpy()[oldest], values[oldest, :-2] = written
-        values[oldest, -2], values[oldest, -1] = outcome
+        oldest = np.argsort(self.usage * 2**32 + self.number)[:kept]
+        self.keys[oldest] = keys[-kept:]
+        self.values[oldest] = np.column_stack([next_states, rewards, returns])[-kept:]
         self.usage[oldest] = self.time
-        self.number[oldest] = self.number.max() + np.arange(1, count + 1)
+        self.number[oldest] = self.written + np.arange(1, kept + 1)
+        self.written += kept
+        self.stored = min(self.stored + kept, self.config.capacity)
         self.neighbours = None
 
     def lay_out(self, mean: np.ndarray, std: np.ndarray) -> None:
@@ -65,14 +64,14 @@ class EpisodicMemory:
         # Of equally near entries the first is read: the last written, so that what came of a state
         # lately is what is remembered of it.
         self.newest_first = np.argsort(-self.number[: len(self)])
-        self.neighbours = Neighbours(self.keys.numpy()[self.newest_first], mean, std)
+        self.neighbours = Neighbours(self.keys[self.newest_first], mean, std)
 
     def search(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The k nearest entries to each state, float32 [N, key], which have been read now.
 
         Returns squared distances per dimension, so that the kernel does not depend on how many
         there are, float32 [N, k] ascending, and the entries, int64 [N, k]. Raises `LookupError` if
-        nothing is stored, or `lay_out` was not called since the last `write`.
+        nothing is stored, or was laid out since it was.
         """
         if not self.neighbours:
             raise LookupError("the episodic memory is empty, or not laid out since it was written")
@@ -83,63 +82,67 @@ class EpisodicMemory:
         return squared_distances / np.float32(states.shape[1]), entries
 
     def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Kernel-weighted mean of the k nearest entries' values, and how similar the nearest is.
+        """Kernel-weighted mean of the k nearest entries' returns, and how similar the nearest is.
 
         states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5). Returns
-        float32 [N, value], and [N] in (0, 1]: the kernel at the nearest key over the kernel at 0.
+        float32 [N], and [N] in (0, 1]: the kernel at the nearest key over the kernel at 0.
         """
-        return recollect(*self.search(states), self.values.numpy(), self.config.kernel_bandwidth)
+        return recollect(*self.search(states), self.values[:, -1], self.config.kernel_bandwidth)
 
-    def lookup(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """`recall` as autograd can follow it, with respect to `queries` and `values`.
+    def lookup(self, queries: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """`recall` as autograd can follow it, with respect to queries and values.
 
-        For whoever trains through the memory; the method does not. Which entries are nearest has
-        no gradient.
+        For whoever trains through the memory; the method does not. `values` stand for the memory's.
+        Which entries are nearest has no gradient.
         """
         _, entries = self.search(queries.detach().float().numpy())
-        chosen = torch.from_numpy(entries)  # [N, k]
         assert self.neighbours is not None  # else `search` has raised
-        squares = (queries[:, None] - self.keys[chosen]) / torch.from_numpy(self.neighbours.std)
-        kernel = 1 / (squares.square().mean(-1) + self.config.kernel_bandwidth)
+        keys, unit = torch.from_numpy(self.keys[entries]), torch.from_numpy(self.neighbours.std)
+        squares = ((queries[:, None] - keys) / unit).square().mean(-1)
+        kernel = 1 / (squares + self.config.kernel_bandwidth)
         weights = kernel / kernel.sum(1, keepdim=True)
-        values = (weights[..., None] * self.values[chosen]).sum(1)
-        return values, self.config.kernel_bandwidth * kernel[:, 0]  # the nearest comes first
+        recalled = (weights[..., None] * values[torch.from_numpy(entries)]).sum(1)
+        return recalled, self.config.kernel_bandwidth * kernel[:, 0]  # the nearest comes first
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""
-        counters = {"usage": self.usage, "number": self.number, "read": self.read}
-        tensors = {name: torch.from_numpy(counter) for name, counter in counters.items()}
-        return {"keys": self.keys, "values": self.values, "time": self.time, **tensors}
+        arrays = {name: torch.from_numpy(getattr(self, name).copy()) for name in ARRAYS}
+        return arrays | {"time": self.time, "written": self.written, "stored": self.stored}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned; to be laid out before the next look-up."""
-        self.keys, self.values = state["keys"].clone(), state["values"].clone()
-        counters = (state[name].numpy().copy() for name in ("usage", "number", "read"))
-        self.usage, self.number, self.read = counters
-        self.time = state["time"]
+        for name in ARRAYS:
+            getattr(self, name)[:] = state[name].numpy()
+        self.time, self.written, self.stored = state["time"], state["written"], state["stored"]
         self.neighbours = None
 
 
-@njit(cache=True, error_model="numpy")
+ARRAYS = ("keys", "values", "usage", "number", "read")  # of `EpisodicMemory`
+
+
+@kernel
+def use(read: np.ndarray, time: int, usage: np.ndarray) -> None:
+    """Count the entries that were read as used at `time`, and as not read since."""
+    for entry in range(len(read)):
+        if read[entry]:
+            usage[entry], read[entry] = time, False
+
+
+@kernel
 def recollect(
-    squared_distances: np.ndarray, indices: np.ndarray, values: np.ndarray, bandwidth: float
+    squared_distances: np.ndarray, indices: np.ndarray, returns: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """What `EpisodicMemory.recall` computes from the nearest entries.
 
-    squared_distances: float32 [N, k], ascending; indices: int64 [N, k], rows of values, float32
-    [M, value].
-    Returns float32 [N, value] and [N]. Compiled, as a dozen operations of torch take longer than
-    the search for the entries.
+    squared_distances: float32 [N, k], ascending; indices: int64 [N, k]; returns: float32 [M].
     """
-    recalled = np.zeros((len(squared_distances), values.shape[1]), np.float32)
-    similarity = np.empty(len(squared_distances), np.float32)
+    recalled, similarity = np.empty((2, len(squared_distances)), np.float32)
     for n in range(len(squared_distances)):
-        kernel = 1 / (squared_distances[n] + bandwidth)
-        total = kernel.sum()
-        for i in range(len(kernel)):
-            weight = np.float32(kernel[i] / total)
-            row = values[indices[n, i]]
-            for j in range(len(row)):
-                recalled[n, j] += weight * row[j]
-        similarity[n] = bandwidth * kernel[0]
+        total = weighted = 0.0
+        for i in range(squared_distances.shape[1]):
+            weight = 1 / (squared_distances[n, i] + bandwidth)
+            total += weight
+            weighted += weight * returns[indices[n, i]]
+        recalled[n] = weighted / total
+        similarity[n] = bandwidth / (squared_distances[n, 0] + bandwidth)
     return recalled, similarity

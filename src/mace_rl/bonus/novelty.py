@@ -1,21 +1,23 @@
 """Novelty of states, in [0, 1]: visitation counts, or k-NN distances and a density estimator."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
-from numba import njit
 
 from mace_rl.agent.adam import Adam
-from mace_rl.agent.normaliser import RunningNormaliser
+from mace_rl.agent.elementary import exp, fma
+from mace_rl.agent.kernels import kernel
+from mace_rl.agent.normaliser import RunningNormaliser, standardised
 from mace_rl.bonus.density import DensityEstimator
 from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.config.plugins import make
 from mace_rl.config.section import ConfigError
 from mace_rl.finite import require_finite
-from mace_rl.nearest import Neighbours, nearest
+from mace_rl.nearest import Neighbours
 from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
@@ -119,16 +121,17 @@ class DensityNovelty(Novelty):
     """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
 
     Both refer to a buffer that covers the visited states, as `normaliser` sees them, whose owner
-    brings it up to date before each `observe` and `load_state_dict`: once it is full, a state that
-    is far from it takes the place of one that is close to another. Both are measured against what
-    is usual there: after each episode a sample of visited states says how far a known state is from
-    its neighbours, and how likely. A state no farther and no less likely than `KNOWN` of them has
-    novelty 0.
+    keeps it up to date. Both are measured against what is usual there: a sample of visited states
+    says how far a known state is from its neighbours, and how likely. A state no farther and no
+    less likely than `KNOWN` of them has novelty 0.
 
     - k-NN: 1 - d*/d, with d the mean distance to the k nearest visited states and d* what is usual;
       the mean over the ensemble's ks.
     - Density: 1 - exp(-(l* - l) / D), with l the log-density, l* what is usual, in nats per
       dimension, of D that vary.
+
+    All of this is brought up to date, `refresh`, at the first end of an episode at which
+    `refresh_every` steps have been taken since it was last; in between nothing changes.
     """
 
     def __init__(
@@ -144,6 +147,8 @@ class DensityNovelty(Novelty):
         self.buffer = np.zeros((config.buffer_size, size), np.float32)
         self.seen = 0  # states written until the buffer was full
         self.steps = 0  # states ever observed, of which one in `write_every` is written
+        self.refreshed = 0  # at which of these steps
+        self.waiting = np.empty((0, size), np.float32)  # states to be written since then
         self.density = DensityEstimator(
             size, config.density_hidden_units, engine, streams["density"]
         )
@@ -151,20 +156,20 @@ class DensityNovelty(Novelty):
         self.batches = streams["density_batches"]
         self.usual_distances = np.zeros(len(config.neighbours))
         self.usual_log_density = 0.0
-        self.ensemble = np.array(config.neighbours)
+        self.ensemble = np.array(sorted(config.neighbours))
         self.largest = max(config.neighbours)
-        self._lay_out()
+        self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
 
     @property
     def visited(self) -> np.ndarray:
         """The states in the buffer, [n, observation]."""
-        return self.buffer[: min(self.seen, len(self.buffer))]
+        return self.buffer[: self.seen]
 
-    def _lay_out(self) -> None:
-        """Prepare what states are compared with until the next ones are observed."""
-        self.mean, self.std = self.normaliser.mean, self.normaliser.std
-        self.dimensions = max(1, int(self.normaliser.varied.sum()))  # of the observation, that vary
-        self.neighbours = Neighbours(self.visited, self.mean, self.std)
+    def _lay_out(self, mean: np.ndarray, std: np.ndarray, varied: np.ndarray) -> None:
+        """Prepare what states are compared with until the next refresh."""
+        self.mean, self.std, self.varied = mean.copy(), std.copy(), varied.copy()
+        self.dimensions = max(1, int(varied.sum()))  # of the observation, that vary
+        self.neighbours = Neighbours(self.visited, mean, std)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """See `Novelty`. 1 everywhere until the buffer has more states than the largest k."""
@@ -176,139 +181,185 @@ class DensityNovelty(Novelty):
     def knn_novelty(self, states: np.ndarray) -> np.ndarray:
         """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
         squared_distances, _ = self.neighbours.nearest(states, self.largest)
-        beyond = share_beyond(squared_distances, self.ensemble, self.usual_distances)
-        return np.add.reduce(beyond, axis=1) / len(self.ensemble)
+        return shares_beyond(squared_distances, self.ensemble, self.usual_distances)
 
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
-        log_probs = self.density.log_prob(standardised(states, self.mean, self.std))
-        return 1 - np.exp(-lack(log_probs, self.usual_log_density) / self.dimensions)
+        log_probs = self.density.log_prob(standardised(states, self.mean, self.std, np.inf))
+        return improbability(log_probs, self.usual_log_density, self.dimensions)
 
     def observe(self, states: np.ndarray) -> None:
-        """Add one in `write_every` of an episode's states and train the density estimator."""
+        """Take in an episode's states, one in `write_every` to be written at the next refresh."""
         chosen = states[-self.steps % self.config.write_every :: self.config.write_every]
+        self.waiting = np.concatenate([self.waiting, chosen])
         self.steps += len(states)
-        free = len(self.buffer) - self.seen
-        self.buffer[self.seen : self.seen + len(chosen[:free])] = chosen[:free]
-        self.seen += len(chosen[:free])
-        if len(chosen) > free:
-            self._replace_redundant(chosen[free:])
-        self._lay_out()
-        visited = self.visited
-        if len(visited) <= self.largest:
+        if self.steps - self.refreshed >= self.config.refresh_every:
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Write what waits, train the density estimator, and see what is usual now."""
+        free = self.waiting[: len(self.buffer) - self.seen]
+        self.buffer[self.seen : self.seen + len(free)] = free
+        self.seen += len(free)
+        normaliser = self.normaliser
+        self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
+        if len(self.waiting) > len(free) and self._replace_redundant(self.waiting[len(free) :]):
+            self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
+        self.waiting, self.refreshed = self.waiting[:0], self.steps
+        if self.seen <= self.largest:
             return
         shape = self.config.density_steps, self.config.density_batch_size
-        samples = visited[self.batches.integers(len(visited), size=shape)]
-        for sample in self.normaliser(samples):
-            self.optimiser.step(-self.density.gradient(sample))
-        log_probs = self.density.log_prob(self.normaliser(samples[-1]))
+        samples = self.visited[self.batches.integers(self.seen, size=shape)]
+        for sample in samples:
+            self.optimiser.step(-self.density.gradient(normaliser(sample)))
+        log_probs = self.density.log_prob(normaliser(samples[-1]))
         require_finite("a log-density", log_probs)
-        self.usual_log_density = float(np.quantile(log_probs, 1 - KNOWN))
+        self.usual_log_density = quantile(log_probs.astype(np.float64), 1 - KNOWN)
         known = samples[-1][: self.config.calibration_states]
         squared_distances, _ = self.neighbours.nearest(known, self.largest + 1)
         distances = mean_distances(squared_distances[:, 1:], self.ensemble)  # the nearest is itself
-        self.usual_distances = np.quantile(distances, KNOWN, axis=0)
+        self.usual_distances = np.array([quantile(column, KNOWN) for column in distances.T])
 
-    def _replace_redundant(self, states: np.ndarray) -> None:
+    def _replace_redundant(self, states: np.ndarray) -> bool:
         """Let states that are far from the buffer take the places of entries close to others.
 
         Far and close by the k-th neighbour, with the largest k: a place is known that has so many
-        states in the buffer, also where they are equal. One after the other, the farthest first:
-        a state is not put in beside its like, and an entry of whose neighbours one has just gone
-        is not redundant any more.
+        states in the buffer, also where they are equal. States without novelty are close already.
+        Returns whether anything was replaced.
         """
-        mean, std = self.normaliser.mean, self.normaliser.std
-        buffer = Neighbours(self.buffer, mean, std)
+        states = states[self.knn_novelty(states) > 0]
+        if len(states) == 0:
+            return False
+        k, buffer = self.largest, self.neighbours
         sample = self.batches.integers(len(self.buffer), size=self.config.calibration_states)
-        sample, k = np.unique(sample), self.largest
+        sample = np.unique(sample)
         apart = buffer.nearest(states, k)[0][:, -1]
         squared, neighbours = buffer.nearest(self.buffer[sample], k + 1)
-        gone: set[int] = set()
-        for old in np.argsort(squared[:, -1]):
-            new = int(np.argmax(apart))
-            if not apart[new] > squared[old, -1]:
-                break
-            if not gone.isdisjoint(neighbours[old].tolist()):
-                continue
-            gone.add(int(sample[old]))
-            self.buffer[sample[old]] = states[new]
-            apart = np.minimum(apart, nearest(states, states[[new]], mean, std, 1)[0][:, 0])
+        redundant_first = np.argsort(squared[:, -1], kind="stable")
+        new = replacements(
+            states, apart, squared[:, -1], neighbours, sample, redundant_first, buffer.std
+        )
+        self.buffer[sample[new >= 0]] = states[new[new >= 0]]
+        return bool((new >= 0).any())
 
     def state_dict(self) -> dict[str, Any]:
         """See `Novelty`."""
-        return {
+        arrays = ("waiting", "usual_distances", "mean", "std", "varied")
+        return {name: torch.from_numpy(getattr(self, name).copy()) for name in arrays} | {
             "buffer": torch.from_numpy(self.visited.copy()),
-            "seen": self.seen,
             "steps": self.steps,
+            "refreshed": self.refreshed,
             "density": self.optimiser.state_dict(),
             "batches": self.batches.bit_generator.state,
-            "usual_distances": torch.from_numpy(self.usual_distances),
             "usual_log_density": self.usual_log_density,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `Novelty`."""
-        self.buffer[: len(state["buffer"])] = state["buffer"].numpy()
-        self.seen, self.steps = state["seen"], state["steps"]
+        self.seen = len(state["buffer"])
+        self.buffer[: self.seen] = state["buffer"].numpy()
+        self.steps, self.refreshed = state["steps"], state["refreshed"]
+        self.waiting = state["waiting"].numpy().copy()
         self.optimiser.load_state_dict(state["density"])
         self.batches.bit_generator.state = state["batches"]
         self.usual_distances = state["usual_distances"].numpy().copy()
         self.usual_log_density = state["usual_log_density"]
-        self._lay_out()
+        self._lay_out(*(state[name].numpy() for name in ("mean", "std", "varied")))
 
 
-# Compiled: for a single state NumPy's calls take longer than the search for its neighbours.
-
-
-@njit(cache=True, error_model="numpy")
+@kernel
 def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Mean distance to the k nearest, for each k of `neighbours`, float64 [T, ensemble].
 
-    squared_distances: float32 [T, at least the largest k], nearest first.
+    squared_distances: float32 [T, at least the largest k], nearest first; neighbours: ascending.
     """
-    distances = np.empty((len(squared_distances), len(neighbours)))
-    sums = np.empty(squared_distances.shape[1])
+    result = np.empty((len(squared_distances), len(neighbours)))
     for t in range(len(squared_distances)):
-        total = 0.0
-        for place in range(len(sums)):
-            total += np.sqrt(np.float64(squared_distances[t, place]))
-            sums[place] = total
+        total, place = 0.0, 0
         for i in range(len(neighbours)):
-            distances[t, i] = sums[neighbours[i] - 1] / neighbours[i]
-    return distances
-
-
-@njit(cache=True, error_model="numpy")
-def share_beyond(
-    squared_distances: np.ndarray, neighbours: np.ndarray, usual: np.ndarray
-) -> np.ndarray:
-    """1 - d*/d of `mean_distances` d beyond the `usual` d*, [ensemble]; else 0: [T, ensemble].
-
-    Where states repeat exactly both are 0, and what is known is still not new.
-    """
-    shares = mean_distances(squared_distances, neighbours)
-    for share in shares:
-        for i in range(len(usual)):
-            share[i] = 1 - usual[i] / share[i] if share[i] > usual[i] else 0.0
-    return shares
-
-
-@njit(cache=True, error_model="numpy")
-def standardised(states: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """(states - mean) / std in float64, as float32 [T, size]."""
-    result = np.empty(states.shape, np.float32)
-    for t in range(len(states)):
-        for i in range(len(mean)):
-            result[t, i] = (states[t, i] - mean[i]) / std[i]
+            while place < neighbours[i]:
+                total += math.sqrt(np.float64(squared_distances[t, place]))
+                place += 1
+            result[t, i] = total / neighbours[i]
     return result
 
 
-@njit(cache=True, error_model="numpy")
-def lack(log_probs: np.ndarray, usual: float) -> np.ndarray:
-    """How far log-densities, float32 [T], are below the `usual` one, float64; 0 if they are not."""
+@kernel
+def shares_beyond(
+    squared_distances: np.ndarray, neighbours: np.ndarray, usual: np.ndarray
+) -> np.ndarray:
+    """The mean over the ensemble of 1 - d*/d where d is beyond the `usual` d*, else 0: [T].
+
+    d: of `mean_distances`. Where states repeat exactly both are 0, and what is known is still not
+    new.
+    """
+    distances, result = (
+        mean_distances(squared_distances, neighbours),
+        np.zeros(len(squared_distances)),
+    )
+    for t in range(len(distances)):
+        for i in range(len(usual)):
+            if not distances[t, i] <= usual[i]:  # so written, NaN stays NaN
+                result[t] += 1 - usual[i] / distances[t, i]
+        result[t] /= len(usual)
+    return result
+
+
+@kernel
+def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.ndarray:
+    """1 - exp(-(l* - l) / D) where l is below the `usual` l*, else 0: float64 [T]."""
     result = np.zeros(len(log_probs))
     for t in range(len(log_probs)):
         below = np.float32(usual) - log_probs[t]
-        if not below < 0:  # so written, NaN stays NaN
-            result[t] = below
+        if not below <= 0:  # so written, NaN stays NaN
+            result[t] = 1 - exp(-below / np.float32(dimensions))
     return result
+
+
+@kernel
+def quantile(values: np.ndarray, share: float) -> float:
+    """The value below which are so many of them, float64 [N], linear between neighbours."""
+    ordered = np.sort(values)
+    place = share * (len(ordered) - 1)
+    before = int(place)
+    after = min(before + 1, len(ordered) - 1)
+    return ordered[before] + (place - before) * (ordered[after] - ordered[before])
+
+
+@kernel
+def replacements(
+    states: np.ndarray,
+    apart: np.ndarray,
+    redundancy: np.ndarray,
+    neighbours: np.ndarray,
+    sample: np.ndarray,
+    redundant_first: np.ndarray,
+    std: np.ndarray,
+) -> np.ndarray:
+    """Which of the new states takes the place of each of the sampled entries, -1 for none, [S].
+
+    apart: squared distance of each new state, [N], to its k-th neighbour in the buffer, redundancy:
+    of each sampled entry, [S], whose neighbours' places are in `neighbours`, [S, k + 1]. One after
+    the other, the farthest first: a state is not put in beside its like, and an entry of whose
+    neighbours one has just gone is not redundant any more.
+    """
+    apart = apart.copy()
+    chosen = np.full(len(sample), -1)
+    for old in redundant_first:
+        new = int(np.argmax(apart))
+        if not apart[new] > redundancy[old]:
+            break
+        kept = True
+        for other in range(len(sample)):
+            if chosen[other] >= 0:
+                kept &= not np.any(neighbours[old] == sample[other])
+        if not kept:
+            continue
+        chosen[old] = new
+        for n in range(len(states)):
+            squared = np.float32(0)
+            for i in range(len(std)):
+                difference = (states[n, i] - states[new, i]) / std[i]
+                squared = fma(difference, difference, squared)
+            apart[n] = min(apart[n], squared)
+    return chosen

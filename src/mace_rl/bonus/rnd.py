@@ -8,6 +8,7 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, mlp
+from mace_rl.agent.products import dot
 from mace_rl.bonus.intrinsic import PredictionError
 from mace_rl.config.bonus import RNDBonus
 from mace_rl.environments.rollout import Episode
@@ -46,7 +47,7 @@ class RandomNetworkDistillation(PredictionError):
     def errors(self, inputs: np.ndarray) -> np.ndarray:
         """See `PredictionError`."""
         difference = self.network.forward(inputs).outputs - self.target.forward(inputs).outputs
-        return np.square(difference).mean(axis=1)
+        return np.array([dot(row, row) for row in difference]) / difference.shape[1]
 
     def gradient(self, inputs: np.ndarray) -> np.ndarray:
         """Of the mean of `errors`."""

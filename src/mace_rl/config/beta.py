@@ -14,6 +14,7 @@ class MetaConfig(Section):
     learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
     max_gradient_norm: PositiveFloat
     horizon: PositiveInt  # updates after an episode that judge its β
+    learn_every: PositiveInt  # βs that have been judged for one step of the optimiser
     prior: NonNegativeFloat  # pull of β's logit back to the initial β's, per unit of distance
     max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
     max_sequence: PositiveInt | None  # longer episodes are condensed to this many elements

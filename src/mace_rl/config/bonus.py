@@ -36,12 +36,13 @@ class NoveltyConfig(Section):
     buffer_size: PositiveInt  # visited states that k-NN and density refer to, a cover of ...
     write_every: PositiveInt  # ... one in so many
     neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
+    refresh_every: PositiveInt  # steps after which what is new is judged anew, at an episode's end
     calibration_states: PositiveInt  # a sample of them says what distance is usual
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
     density_hidden_units: PositiveInt
     density_learning_rate: PositiveFloat = Field(lt=1)
     density_batch_size: PositiveInt
-    density_steps: PositiveInt  # gradient steps of the density estimator after each episode
+    density_steps: PositiveInt  # gradient steps of the density estimator in a refresh
 
     @model_validator(mode="after")
     def _neighbours_fit(self) -> "NoveltyConfig":

@@ -20,9 +20,10 @@ MEMORY: dict[str, Any] = {
 NOVELTY: dict[str, Any] = {
     "kind": "auto",
     "count_decay": 0.9995,
-    "buffer_size": 5000,
+    "buffer_size": 2048,
     "write_every": 4,
     "neighbours": [10, 15, 20],
+    "refresh_every": 256,
     "calibration_states": 32,
     "knn_weight": 0.7,
     "density_hidden_units": 64,

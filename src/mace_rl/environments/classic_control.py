@@ -116,10 +116,11 @@ def _observe(which, state, observation):
 
 
 @njit(cache=True)
-def episode(which, state, first_observation, mean, inverse_std, clip, parameters, sizes, uniforms):
+def episode(which, state, first_observation, policy, uniforms):
     """One whole episode of CartPole (`which` = 0) or Acrobot (1) from a reset environment's state.
 
-    state: float64 [4], left at the final state; uniforms: float64 [time limit], one a step.
+    state: float64 [4], left at the final state; policy: a `CompiledActing`; uniforms: float64
+    [time limit], one a step.
     Returns observations float32 [T + 1, size], actions int64 [T], log-probabilities float32 [T],
     rewards float64 [T], terminated.
     """
@@ -133,9 +134,7 @@ def episode(which, state, first_observation, mean, inverse_std, clip, parameters
     terminated = False
     t = 0
     while t < limit and not terminated:
-        actions[t], log_probs[t] = act_discrete(
-            observations[t], mean, inverse_std, clip, parameters, sizes, uniforms[t]
-        )
+        actions[t], log_probs[t] = act_discrete(observations[t], policy, uniforms[t])
         if which == CARTPOLE:
             rewards[t], terminated = step_cartpole(state, actions[t])
         else:

@@ -98,7 +98,7 @@ def roll_out_compiled(
     which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
     return Episode(
         *classic_control.episode(
-            which, np.array(inner.state, np.float64), observation, *policy[:5], noise
+            which, np.array(inner.state, np.float64), observation, policy, noise
         )
     )
 

@@ -200,5 +200,5 @@ def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, 
         machine = record["machine"]
         found["machine"][f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}"] += 1
         versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-        found["software"][f"{versions}; {record['arithmetic']['arithmetic']} arithmetic"] += 1
+        found["software"][versions] += 1
     return {name: counter.most_common() for name, counter in found.items()}

@@ -72,7 +72,8 @@ class MostProbable(NetworkActing):
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """See `ActingPolicy`; the noise does not matter."""
-        seen = kernels.normalise(observation, self.mean, self.inverse_std, self.clip)
+        seen = np.empty_like(self.mean)
+        kernels.normalise(observation, self.mean, self.inverse_std, self.clip, seen)
         with torch.no_grad():
             outputs = self.policy.network.forward(seen[None]).outputs
         action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]

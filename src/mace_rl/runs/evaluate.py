@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mace_rl.agent.advantages import total
 from mace_rl.environments.rollout import draw_noise, rollout_for
 from mace_rl.runs.agent import load_acting
 
@@ -21,5 +22,5 @@ def evaluate(directory: Path, episodes: int, seed: int, deterministic: bool = Fa
     returns = np.empty(episodes)
     for episode in range(episodes):
         played = rollout(environment, policy, draw_noise(environment, generator))
-        returns[episode] = played.rewards.sum()
+        returns[episode] = total(played.rewards)
     return returns

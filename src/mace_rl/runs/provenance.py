@@ -26,7 +26,7 @@ PACKAGES = (
     "pybullet-envs-gymnasium",
 )
 # What every run.json has.
-KEYS = {"config", "versions", "arithmetic", "sources", "machine", "outputs"}
+KEYS = {"config", "versions", "sources", "machine", "outputs"}
 
 
 class ProvenanceError(Refusal, ValueError):

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.linalg.cython_blas  # noqa: F401  (numba loads it: before threads are limited)
 import torch
 from threadpoolctl import threadpool_limits
 
-from mace_rl import arithmetic, files
+from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
@@ -59,10 +60,8 @@ def run(
     Continues from its checkpoint if there is one of this very configuration, code and versions;
     otherwise says so in the log and starts afresh. With `keep_checkpoint` a last one stays, from
     which results that are deleted come back without training. Uses one thread. Raises `RunError`
-    if another process is at work in `directory`, and `UnfitArithmeticError` if arithmetic is not
-    what was chosen.
+    if another process is at work in `directory`.
     """
-    arithmetic.require()
     torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
     with exclusive(directory), threadpool_limits(1):
@@ -112,7 +111,6 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
     return {
         "config": config.settings(),
         "versions": provenance.versions(),
-        "arithmetic": arithmetic.in_use(),
         "sources": provenance.sources_of(config),
     }
 

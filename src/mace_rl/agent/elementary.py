@@ -1,0 +1,114 @@
+"""exp, log and tanh of float32 as written-out arithmetic, and the fused multiply-add.
+
+The C library's functions, NumPy's and LLVM's choose by the processor how they compute, so their
+last bits differ. These are sums and products in a written order, the same bits everywhere, without
+branches, so that loops over them become vector operations. NaN stays NaN: a run that goes bad is
+noticed by it. (Mind the order of arguments to min and max.)
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+f32 = np.float32
+
+
+@intrinsic
+def fma(context: Any, a: Any, b: Any, c: Any) -> Any:
+    """a · b + c rounded once, of three float32 or three float64."""
+    if not a == b == c or a not in (types.float32, types.float64):
+        return None
+    name = "fma.f32" if a is types.float32 else "fma.f64"
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = arguments[0].type
+        function = builder.module.declare_intrinsic(
+            f"llvm.{name}", (), ir.FunctionType(kind, [kind] * 3)
+        )
+        return builder.call(function, arguments)
+
+    return a(a, b, c), codegen
+
+
+@intrinsic
+def bits_of(context: Any, x: Any) -> Any:
+    """The bits of a float32 as int32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(types.float32), codegen
+
+
+@intrinsic
+def float_of(context: Any, bits: Any) -> Any:
+    """The float32 that has these bits, int32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), codegen
+
+
+@njit(cache=True, error_model="numpy")
+def tanh(x):
+    """Hyperbolic tangent, to 2e-7.
+
+    tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction cut off
+    after its seventh term: an error of 1e-8, and rounding, by which the result can exceed 1. From
+    x = 9.2 on all is 1.
+    """
+    y = min(max(x * f32(0.5), f32(-4.6)), f32(4.6))
+    s = y * y
+    p = y * fma(fma(s + f32(378), s, f32(17325)), s, f32(135135))
+    q = fma(fma(fma(f32(28), s, f32(3150)), s, f32(62370)), s, f32(135135))
+    return f32(2) * p * q / fma(q, q, p * p)
+
+
+ROUNDING = f32(1.5 * 2**23)  # added to a small number, it leaves no digits after the point
+
+
+@njit(cache=True, error_model="numpy")
+def exp(x):
+    """eˣ, to 1 unit in the last place; Inf above 88.72, 0 below -103.97.
+
+    eˣ = 2ⁿ eʳ with n the nearest integer to x / ln 2, and |r| ≤ ln 2 / 2, where a polynomial does
+    (coefficients: Cephes, expf).
+    """
+    x = min(max(x, f32(-105)), f32(90))
+    shifted = fma(x, f32(1 / math.log(2)), ROUNDING)
+    n = shifted - ROUNDING
+    r = fma(n, f32(2.12194440e-4), fma(n, f32(-0.693359375), x))  # ln 2 in two parts
+    y = fma(fma(f32(1.9875691500e-4), r, f32(1.3981999507e-3)), r, f32(8.3334519073e-3))
+    y = fma(fma(fma(y, r, f32(4.1665795894e-2)), r, f32(1.6666665459e-1)), r, f32(5.0000001201e-1))
+    y = fma(y, r * r, r) + f32(1)
+    power = bits_of(shifted) - bits_of(ROUNDING)
+    half = power >> np.int32(1)  # 2ⁿ itself may not be a float32
+    rest = power - half
+    one = np.int32(127)
+    return y * float_of((half + one) << np.int32(23)) * float_of((rest + one) << np.int32(23))
+
+
+@njit(cache=True, error_model="numpy")
+def log(x):
+    """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf.
+
+    x = 2ⁿ m with m between √½ and √2, where a polynomial does (coefficients: Cephes, logf).
+    """
+    bits = bits_of(x) - np.int32(0x3F3504F3)  # of √½
+    n = f32(bits >> np.int32(23))
+    f = float_of((bits & np.int32(0x007FFFFF)) + np.int32(0x3F3504F3)) - f32(1)
+    y = fma(fma(f32(7.0376836292e-2), f, f32(-1.1514610310e-1)), f, f32(1.1676998740e-1))
+    y = fma(
+        fma(fma(y, f, f32(-1.2420140846e-1)), f, f32(1.4249322787e-1)), f, f32(-1.6668057665e-1)
+    )
+    y = fma(fma(fma(y, f, f32(2.0000714765e-1)), f, f32(-2.4999993993e-1)), f, f32(3.3333331174e-1))
+    s = f * f
+    y = fma(n, f32(-2.12194440e-4), y * f * s)
+    y = fma(f32(-0.5), s, y) + f
+    y = fma(n, f32(0.693359375), y)
+    return y if x < f32(math.inf) else x

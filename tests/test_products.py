@@ -1,0 +1,156 @@
+"""Products, sums and elementary functions: exact chains, the same bits for every processor."""
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numba import njit
+from numba.core.registry import cpu_target
+
+from mace_rl.agent import elementary, products
+
+SIZES = st.integers(1, 13)
+NUMBERS = st.floats(-4, 4, width=32)
+
+
+def chain(a: np.ndarray, b: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The same in extended precision, which holds a product of two float32 exactly."""
+    result = np.broadcast_to(start, (len(a), b.shape[1])).astype(np.longdouble)
+    for k in range(len(b)):
+        exact = np.longdouble(a[:, k, None]) * np.longdouble(b[k]) + result
+        result = exact.astype(np.float32).astype(np.longdouble)
+    return result.astype(np.float32)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data(), SIZES, st.integers(1, 40), st.sampled_from([16, 32, 64, 80, 128, 256, 272]))
+def test_every_element_is_one_chain_of_fused_multiply_adds(data, rows, count, columns):
+    draw = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    a = draw.standard_normal((rows, count)).astype(np.float32)
+    b = draw.standard_normal((count, columns)).astype(np.float32)
+    start, c = draw.standard_normal((2, rows, columns)).astype(np.float32)
+    products.product(a, b, start[0], c)
+    assert (c == chain(a, b, start[0])).all()
+    transposed = np.asfortranarray(a)  # other distances
+    products.product(transposed, b, start[0], c)
+    assert (c == chain(a, b, start[0])).all()
+    # A chain may be cut anywhere, and rows do not know of each other.
+    half = count // 2
+    cut, one = start.copy(), np.empty((1, columns), np.float32)
+    products.add_product(a[:, :half], b[:half], cut)
+    products.add_product(a[:, half:], b[half:], cut)
+    assert (cut == chain(a, b, start)).all()
+    products.product(a[-1:], b, start[0], one)
+    assert (one[0] == c[-1]).all()
+
+
+def test_values_agree_with_float64():
+    draw = np.random.default_rng(0)
+    a, b = (draw.standard_normal(shape).astype(np.float32) for shape in ((256, 64), (64, 64)))
+    c = np.empty((256, 64), np.float32)
+    products.product(a, b, np.zeros(64, np.float32), c)
+    np.testing.assert_allclose(c, a.astype(np.float64) @ b, atol=2e-5)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_bad_numbers_pass_through_and_spread_no_farther(bad):
+    a, b = np.ones((5, 3), np.float32), np.ones((3, 16), np.float32)
+    a[2, 1] = bad
+    c = np.empty((5, 16), np.float32)
+    products.product(a, b, np.zeros(16, np.float32), c)
+    np.testing.assert_array_equal(c[2], np.full(16, bad))
+    assert (np.delete(c, 2, axis=0) == 3).all()
+
+
+@settings(deadline=None)
+@given(arrays(np.float64, st.integers(0, 300), elements=st.floats(-1e3, 1e3)))
+def test_dot_agrees_with_an_exact_sum(values):
+    assert products.dot(values, values) == pytest.approx(math.fsum(values * values), rel=1e-13)
+
+
+@njit
+def over(function, values):
+    result = np.empty_like(values)
+    for i in range(len(values)):
+        result[i] = function(values[i])
+    return result
+
+
+@pytest.mark.parametrize(
+    ("ours", "exact", "low", "high", "relative", "absolute"),
+    [
+        (elementary.exp, np.exp, -87.3, 88.7, 1.2e-7, 0.0),
+        (elementary.log, np.log, 1e-37, 3e38, 1.2e-7, 1e-9),
+        (elementary.log, np.log, 0.5, 2.0, 1.2e-7, 1e-9),
+        (elementary.tanh, np.tanh, -12.0, 12.0, 0.0, 2e-7),
+    ],
+)
+def test_elementary_functions_are_as_exact_as_they_say(ours, exact, low, high, relative, absolute):
+    spaced = np.geomspace if low > 0 else np.linspace
+    values = spaced(low, high, 300_001).astype(np.float32)
+    expected = exact(values.astype(np.float64))
+    np.testing.assert_allclose(over(ours, values), expected, rtol=relative, atol=absolute)
+
+
+def test_elementary_functions_at_the_ends():
+    ends = np.array([math.nan, math.inf, -math.inf, 89.0, -104.0, 0.0], np.float32)
+    np.testing.assert_array_equal(
+        over(elementary.exp, ends), np.array([math.nan, math.inf, 0, math.inf, 0, 1], np.float32)
+    )
+    np.testing.assert_array_equal(over(elementary.tanh, ends[:3]), np.float32([math.nan, 1, -1]))
+    np.testing.assert_array_equal(over(elementary.log, ends[:2]), ends[:2])
+
+
+DIGEST = """
+import mace_rl, hashlib, numpy as np
+from mace_rl.agent import products
+from mace_rl.train import Trainer
+from mace_rl.cli import CONFIG
+from mace_rl.config.study import read_study
+draw = np.random.default_rng(0)
+found = hashlib.sha256()
+for rows, count, columns in [(1, 64, 512), (5, 3, 16), (13, 64, 80), (64, 256, 64)]:
+    a, b = draw.standard_normal((rows, count)), draw.standard_normal((count, columns))
+    c = np.empty((rows, columns), np.float32)
+    products.product(a.astype(np.float32), b.astype(np.float32), np.zeros(columns, np.float32), c)
+    found.update(c.tobytes())
+config = read_study([CONFIG]).run_config("CartPole-v1", "mace_full", 0)
+trainer = Trainer(config.model_copy(update={"episodes": 40}))
+for _ in trainer.run():
+    pass
+found.update(trainer.ppo.policy.parameters.tobytes())
+found.update(str(trainer.diagnostics).encode())
+print(found.hexdigest())
+"""
+TARGETS = {
+    "haswell": "+avx2,+fma,+bmi,+bmi2,+f16c,+lzcnt,+popcnt,+movbe",
+    "skylake-avx512": "+avx512f,+avx512vl,+avx512dq,+avx512bw,+avx512cd,+avx2,+fma,+bmi,+bmi2",
+    "znver5": "+avx512f,+avx512vl,+avx512dq,+avx512bw,+avx512cd,+avx2,+fma,+bmi,+bmi2",
+}
+
+
+@pytest.mark.slow
+def test_bits_do_not_depend_on_what_the_compiler_compiles_for():
+    """A whole training with everything in it, beside products by every tile."""
+    _, name, features = cpu_target.target_context.codegen().magic_tuple()
+    wide = "+avx512f" in features.split(",")
+    found = {}
+    for target, having in TARGETS.items():
+        if "avx512" in having and not wide:
+            continue  # this machine cannot run it
+        given = {"NUMBA_CPU_NAME": target, "NUMBA_CPU_FEATURES": having}
+        done = subprocess.run(
+            [sys.executable, "-c", DIGEST], env=os.environ | given, capture_output=True, text=True
+        )
+        found[target] = done.stdout.strip() or done.stderr
+    plain = subprocess.run([sys.executable, "-c", DIGEST], capture_output=True, text=True)
+    found[name] = plain.stdout.strip()
+    assert len(set(found.values())) == 1, found
+    assert len(plain.stdout.strip()) == len(hashlib.sha256().hexdigest())
