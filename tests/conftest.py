@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import mace_rl  # noqa: F401  isort: skip  (arithmetic is chosen before NumPy is imported)
+import mace_rl  # noqa: F401  isort: skip  (pins NumPy before it is imported)
 
 import gymnasium
 import pytest
