@@ -10,9 +10,9 @@ import scipy.stats
 from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import check
 from mace_rl.results.aggregate import SCORED
-from mace_rl.results.claims import CORRELATION
 from mace_rl.results.metrics import Metric, metrics_columns
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
+from mace_rl.results.protocol import AREA, CORRELATION, QUESTIONS, ROBUST
 
 SETTINGS = {
     "final_fraction": 0.1,
@@ -94,6 +94,22 @@ def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> p
         if variant == "mace_full":
             row[CORRELATION] = advantage[variant] + noise * draws.normal()
         rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def table_for_questions(seeds: int, **better: float) -> pd.DataFrame:
+    """metrics.csv with mean returns of all that our questions need; some variants are better."""
+    draws = np.random.default_rng(4)
+    parts = [part for claim in QUESTIONS for part in claim.parts[ROBUST]]
+    environments = dict.fromkeys(env for part in parts for env in part.environments)
+    variants = dict.fromkeys(name for part in parts for name in (part.variant, part.baseline))
+    cells = itertools.product(environments, variants)
+    rows = [
+        {"env": env, "variant": variant, "seed": seed, "episodes": 2000}
+        | {AREA: draws.normal() + better.get(variant, 0)}
+        for env, variant in cells
+        for seed in range(seeds)
+    ]
     return pd.DataFrame(rows)
 
 

@@ -1,25 +1,33 @@
-"""The verdicts on the paper's claims, from tables in which the truth is known."""
+"""The verdicts of the protocol's rule, from tables in which the truth is known."""
+
+import itertools
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import EPISODES, table_for_claims
+from invented import EPISODES, table_for_claims, table_for_questions
 
-from mace_rl.config.study import Study
+from mace_rl.config.study import Study, read_study
 from mace_rl.results import claims
-from mace_rl.results.claims import CLAIMS, CORRELATION, LITERAL, ROBUST
+from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, ROBUST, WAYS, asked
 
+PAPERS = FAMILIES[:1]
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
 PLAIN = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
 FIXED = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}
+WORST = {"ppo": 0.2, "mace_fixed": 0.2, "mace_full": -0.1}
 VAST = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.6}
+SLIGHT = {"ppo": 0.0, "mace_fixed": 0.01, "mace_full": 0.03}
 BUT_C6 = [claim.name for claim in CLAIMS if claim.name != "C6"]  # which says that fixed is first
+OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
 
 
 def parts_of(frame: pd.DataFrame, study: Study, claim: str, how: str = ROBUST) -> list[dict]:
-    (record,) = (one for one in claims.ledger(frame, study.metrics) if one["claim"] == claim)
+    found = claims.ledger(frame, study.metrics, PAPERS)
+    (record,) = (one for one in found if one["claim"] == claim)
     return record[how]["parts"]
 
 
@@ -27,81 +35,96 @@ def parts_of(frame: pd.DataFrame, study: Study, claim: str, how: str = ROBUST) -
     ("seeds", "advantage", "noise", "which", "expected"),
     [
         (20, PLAIN, 0.02, BUT_C6, "reproduced"),
-        (20, PLAIN, 0.02, ["C6"], "contradicted"),
-        (20, FIXED, 0.02, ["C6", "C9"], "reproduced"),  # C9 asks nothing of the others
-        (20, FIXED, 0.02, ["C1", "C2", "C3", "C4", "C5", "C7", "C8", "C10"], "contradicted"),
-        (20, EQUAL, 0.02, [*BUT_C6, "C6"], "contradicted"),  # nothing worth mentioning
-        (12, VAST, 1.0, BUT_C6, "inconclusive"),  # what seeds cannot tell apart
-        (9, EQUAL, 0.0, [*BUT_C6, "C6"], "inconclusive"),  # too few decide nothing
-        (9, PLAIN, 0.02, [*BUT_C6, "C6"], "inconclusive"),
-        (1, PLAIN, 0.02, [*BUT_C6, "C6"], "inconclusive"),
+        (20, PLAIN, 0.02, ["C6"], "not reproduced"),  # it is before PPO, not before the learned
+        (20, FIXED, 0.02, ["C6", "C9"], "reproduced"),
+        (20, FIXED, 0.02, OF_FULL, "not reproduced"),
+        (20, WORST, 0.02, BUT_C6, "reversed"),
+        (20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),  # nothing worth mentioning
+        (20, SLIGHT, 0.005, [*BUT_C6, "C6"], "not reproduced"),  # beyond chance, and too small
+        (12, VAST, 1.0, BUT_C6, "open"),  # what seeds cannot tell apart
+        (9, EQUAL, 0.0, [*BUT_C6, "C6"], "open"),  # too few decide nothing
+        (9, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
+        (1, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
     ],
 )
 def test_verdicts_where_the_truth_is_known(
     study: Study, seeds: int, advantage: dict, noise: float, which: list[str], expected: str
 ) -> None:
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    records = claims.ledger(table_for_claims(seeds, advantage, noise), settings)
-    found = {
-        record["claim"]: {record[how]["verdict"] for how in (LITERAL, ROBUST)} for record in records
-    }
+    records = claims.ledger(table_for_claims(seeds, advantage, noise), settings, PAPERS)
+    found = {record["claim"]: {record[how]["verdict"] for how in WAYS} for record in records}
     assert {name: found[name] for name in which} == {name: {expected} for name in which}
 
 
 @pytest.mark.parametrize(
-    ("seeds", "p_holm", "difference", "high", "expected"),
+    ("seeds", "difference", "p_holm", "p_equivalent_holm", "expected"),
     [
-        (10, 0.049, 3.0, 9.0, "holds"),
-        (10, 0.049, 3.0, 4.9, "holds"),  # beyond chance, though not worth mentioning
-        (10, 0.049, -3.0, 9.0, "fails"),
-        (10, 0.05, 3.0, 4.9, "fails"),
-        (10, 0.05, -3.0, 4.9, "fails"),
-        (10, 0.05, 3.0, 5.0, "open"),
-        (10, 0.05, -3.0, 5.0, "open"),
-        (9, 0.001, 3.0, 9.0, "open"),
-        (9, 0.001, -3.0, 4.9, "open"),
+        (10, 3.0, 0.049, 0.05, "shown"),
+        (10, -3.0, 0.049, 0.05, "reversed"),
+        (10, 3.0, 0.049, 0.049, "absent"),  # beyond chance, though not worth mentioning
+        (10, -3.0, 0.9, 0.049, "absent"),
+        (10, 3.0, 0.05, 0.05, "open"),
+        (9, 3.0, 0.001, 0.9, "open"),
+        (9, 3.0, 0.9, 0.001, "open"),
     ],
 )
 def test_a_part_comes_out_by_the_written_rule(
-    seeds: int, p_holm: float, difference: float, high: float, expected: str
+    seeds: int, difference: float, p_holm: float, p_equivalent_holm: float, expected: str
 ) -> None:
-    """The margin is 5, and the p value that is not corrected says nothing."""
+    """The p values that are not corrected say nothing."""
     finding = claims.Finding(
         *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", seeds, difference),
-        *(-99.0, high, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, p_holm),
+        *(-99.0, 99.0, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001),
+        *(p_holm, p_equivalent_holm),
     )
-    assert (finding.worth_mentioning, finding.p_value) == (5, 0.0001)
+    assert (finding.p_value, finding.p_equivalent) == (0.0001, 0.0001)
     assert claims.outcome(finding) == expected
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "expected"),
-    [
-        (["holds", "holds"], "reproduced"),
-        (["holds", "open"], "inconclusive"),
-        (["open"], "inconclusive"),
-        (["holds", "fails"], "contradicted"),
-        (["open", "fails"], "contradicted"),
-    ],
-)
-def test_verdict(outcomes: list[str], expected: str) -> None:
-    assert claims.verdict(outcomes) == expected
+def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
+    """As its table says, in its order."""
+    outcomes = "shown", "reversed", "absent", "open"
+    for found in itertools.product(outcomes, repeat=3):
+        if all(one == "shown" for one in found):
+            expected = "shown"
+        elif found.count("reversed") and not found.count("shown"):
+            expected = "reversed"
+        elif found.count("reversed") or found.count("absent"):
+            expected = "absent"
+        else:
+            expected = "open"
+        assert claims.verdict(found) == expected
+
+
+def test_what_a_study_can_answer() -> None:
+    named = [
+        {name for claim in family.claims for parts in claim.parts.values() for part in parts
+         for name in (*part.environments, part.variant, part.baseline)} - {None}
+        for family in FAMILIES
+    ]  # fmt: skip
+    for family, names in zip(FAMILIES, named, strict=True):
+        assert asked(names, names) == [family]
+        for name in names:
+            assert asked(names - {name}, names - {name}) == []
+    assert asked(named[0] | named[1], named[0] | named[1]) == list(FAMILIES)
 
 
 def test_all_parts_are_corrected_together_and_have_the_margin_of_what_they_measure(
     study: Study,
 ) -> None:
-    records = claims.ledger(table_for_claims(12, SMALL, noise=0.1), study.metrics)
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    records = claims.ledger(table_for_claims(12, SMALL, noise=0.1), settings, PAPERS)
     for how in (LITERAL, ROBUST):
         parts = [part for record in records for part in record[how]["parts"]]
         # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
         count = len(parts)
         assert count == 24
-        p = sorted(part["p_value"] for part in parts)
-        holm = [max(min(1, p[i] * (count - i)) for i in range(k + 1)) for k in range(count)]
-        expected = dict(zip(p, holm, strict=True))
-        for part in parts:
-            assert part["p_holm"] == pytest.approx(expected[part["p_value"]])
+        for given, corrected in (("p_value", "p_holm"), ("p_equivalent", "p_equivalent_holm")):
+            p = sorted(part[given] for part in parts)
+            holm = [max(min(1, p[i] * (count - i)) for i in range(k + 1)) for k in range(count)]
+            expected = dict(zip(p, holm, strict=True))
+            for part in parts:
+                assert part[corrected] == pytest.approx(expected[part[given]])
         assert len({round(part["p_holm"], 9) for part in parts}) > 5  # they are not all 1
         margins = {
             (part["metric"], *part["environments"]): part["worth_mentioning"] for part in parts
@@ -130,7 +153,7 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     assert part["probability"] == pytest.approx(u / 144)
     # Verdicts are of 95 % intervals, whatever those of the tables have.
     wide = study.metrics.model_copy(update={"confidence": 0.5})
-    assert claims.ledger(frame, wide)[0][ROBUST]["parts"][0] == part
+    assert claims.ledger(frame, wide, PAPERS)[0][ROBUST]["parts"][0] == part
 
 
 def test_one_seed_has_estimates_but_no_tests(study: Study) -> None:
@@ -158,3 +181,24 @@ def test_variants_of_different_budgets_are_compared_within_the_shorter(study: St
     over_ppo, over_fixed = parts_of(frame, study, "C5")
     assert (over_ppo["difference"], over_ppo["probability"]) == (0, 0.5)
     assert (over_ppo["worth_mentioning"], over_fixed["worth_mentioning"]) == (100, 25)
+
+
+def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds() -> None:
+    """Q7: three tasks, of which one has more seeds."""
+    root = Path(__file__).parents[1]
+    settings = read_study([root / "config.yaml", root / "config" / "questions.yaml"]).metrics
+    settings = settings.model_copy(update={"bootstrap_repetitions": 1000})
+    frame = table_for_questions(30, mace_full=0.3)
+    frame = frame[(frame["env"] == "BarrenRegion-v0") | (frame["seed"] < 12)]
+    found = claims.ledger(frame, settings, FAMILIES[1:])
+    (part,) = next(record for record in found if record["claim"] == "Q7")[ROBUST]["parts"]
+    areas = frame.set_index(["env", "variant", "seed"])["area_under_curve"].sort_index()
+    expected = [
+        (areas[env, "mace_full"] - areas[env, "mace_no_memory"]).mean()
+        / (settings.reference_return[env] - settings.random_return[env])
+        for env in ("BarrenRegion-v0", "NoisyMountainCar-v0", "NoisyDeepSea10-v0")
+    ]
+    assert part["difference"] == pytest.approx(np.mean(expected))
+    assert (part["worth_mentioning"], part["seeds"]) == (0.05, 12)
+    assert [len(record[ROBUST]["parts"]) for record in found] == [5, 3, 5, 5, 5, 4, 1, 1]
+    assert all(LITERAL not in record for record in found)

@@ -22,11 +22,11 @@ from mace_rl.config.study import read_study
 from mace_rl.report.animations import animations
 from mace_rl.report.page import Making, _costs, duration, short
 from mace_rl.report.page import page as build
-from mace_rl.results.claims import LITERAL, ROBUST
 from mace_rl.results.comparisons import regret
 from mace_rl.results.figures import Look
 from mace_rl.results.pages import read_data
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
+from mace_rl.results.protocol import WAYS
 from mace_rl.results.renderings import number
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.provenance import read_record
@@ -137,12 +137,12 @@ def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -
 
     # Each claim has its verdicts and its parts.
     ledger = json.loads((results / "claims.json").read_text(encoding="utf-8"))["claims"]
-    assert [found["class"] for found in page.all("verdicts", "td")] == ["inconclusive"] * 20
-    assert "0 reproduced, 0 contradicted, 10 inc" in page.words("verdicts")
+    assert [found["class"] for found in page.all("verdicts", "td")] == ["open"] * 20
+    assert "0 reproduced, 0 reversed, 0 not reproduced, 10 open" in page.words("verdicts")
     claims = page.all("ledger", "details")
     assert [found["id"] for found in claims] == [f"C{n}" for n in range(1, 11)]
     assert all(record["statement"] in page.words("ledger") for record in ledger)
-    rows = sum(len(record[how]["parts"]) for record in ledger for how in (LITERAL, ROBUST))
+    rows = sum(len(record[how]["parts"]) for record in ledger for how in WAYS)
     assert len(page.all("ledger", "tr")) == rows + 2 * len(claims)
 
     # Figures have a panel for each environment.

@@ -100,6 +100,21 @@ def test_stratified_comparison():
     assert s.stratified_comparison(strata[:1], 0.95, 1000, generator(3)) == one
 
 
+def test_equivalence_is_two_one_sided_sign_flip_tests():
+    """Of one stratum and of two that weigh alike, against all sign patterns."""
+    rng = np.random.default_rng(5)
+    for sizes, margin in product([(7,), (4, 6)], (0.3, 2.0)):
+        strata = [rng.normal(0.2, 0.5, size) for size in sizes]
+        worst = 0.0
+        for shift, side in ((margin, 1), (-margin, -1)):
+            weighted = [side * (values + shift) / len(values) for values in strata]
+            values = np.concatenate(weighted)
+            signs = np.array(list(product((-1, 1), repeat=len(values))))
+            worst = max(worst, np.mean(signs @ values >= values.sum() - 1e-9))
+        assert s.equivalence(strata, margin, 2000, generator()) == pytest.approx(worst)
+    assert np.isnan(s.equivalence([np.array([0.1])], 1.0, 2000, generator()))
+
+
 def test_strata_of_few_seeds_have_students_interval_with_the_freedom_of_the_smallest():
     draws = generator()
     strata = [draws.normal(1.0, 1, 5), draws.normal(0.2, 3, 12), draws.normal(0, 2, 12)]

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
 
 from mace_rl.config.study import Study, read_study
-from mace_rl.environments.tasks import BarrenRegion, DeepSea, MetresPassed
+from mace_rl.environments.tasks import BarrenRegion, DeepSea, MetresPassed, NoisyDeepSea
 
 ROOT = Path(__file__).parents[1]
 NORTH, EAST, SOUTH, WEST = range(4)
@@ -23,7 +23,7 @@ Table = Mapping[int, Mapping[int, list[tuple[float, int, float, bool]]]]
 
 @pytest.fixture(scope="module")
 def study() -> Study:
-    return read_study([ROOT / "config.yaml", ROOT / "config" / "exploration.yaml"])
+    return read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"])
 
 
 def value(table: Table, start: int, steps: int, over: Callable) -> float:
@@ -56,7 +56,7 @@ def play(env: gymnasium.Env, actions: Iterable) -> tuple[list, list[float], bool
 
 
 def test_gymnasium_accepts_them(study, recwarn):
-    for name in study.environments:
+    for name in [*study.environments[2:], "SparseHopper-v0"]:
         check_env(gymnasium.make(name, disable_env_checker=True).unwrapped, skip_render_check=True)
         # SparseHopper's is about a method `seed`, which Bullet's have.
         assert name == "SparseHopper-v0" or not [str(warning.message) for warning in recwarn]
@@ -72,10 +72,30 @@ def test_random_returns_of_the_study(study):
         expected[name] = value(env.P, start, 200, np.mean)
     env = BarrenRegion()
     expected["BarrenRegion-v0"] = value(transitions(env), env.kinds.index("S"), 60, np.mean)
-    expected |= dict.fromkeys(("SparseMountainCar-v0", "SparseHopper-v0"), 0.0)
-    for name in study.environments:
+    expected |= {"SparseMountainCar-v0": 0.0, "NoisyMountainCar-v0": -0.001 * 200 / 4}
+    # A third of all episodes is spent in the archive. Of the actions elsewhere two are the same.
+    right = [(2 - action) / 3 for action in NoisyDeepSea(10, 1).right]
+    expected["NoisyDeepSea10-v0"] = -0.001 * 10 / 3 + at_random(right, 10)
+    for name in study.environments[2:]:
         given = study.metrics.random_return_in(name)
         assert given == pytest.approx(expected[name], rel=0.02, abs=0.001), name
+
+
+def at_random(right: list[float], size: int) -> float:
+    """Expected return in the noisy deep sea of episodes that end outside the archive, times theirs.
+
+    right: how likely an action is to lead to the right, for each cell, [size²].
+    """
+
+    def ahead(row: int, column: int) -> float:
+        if row == size:
+            return 0.0
+        p = right[row * size + column] if row else 1 / 3
+        reward = float(column == size - 1) - 0.01 / size
+        there, back = (ahead(row + 1, max(0, min(column + d, size - 1))) for d in (1, -1))
+        return p * (reward + there) + (1 - p if row else 1 / 3) * back
+
+    return ahead(0, 0)
 
 
 # --- Gymnasium's --------------------------------------------------------------------------------
@@ -100,6 +120,28 @@ def test_mountain_car_is_gymnasiums_but_for_the_reward(skilled):
         assert (len(rewards) < 200) == skilled == (state[0] >= 0.5)
 
 
+def test_the_television_of_the_noisy_mountain_car():
+    """Watching is coasting, for 0.001; what is on is new each time, and off without it."""
+    noisy, plain = gymnasium.make("NoisyMountainCar-v0"), gymnasium.make("SparseMountainCar-v0")
+    shown, paid = [], []
+    for seed in range(20):
+        state, rng = noisy.reset(seed=seed)[0], np.random.default_rng(seed)
+        assert np.array_equal(state, [*plain.reset(seed=seed)[0], 0])
+        over = False
+        while not over:
+            swing_up = rng.random() < 0.9 * (seed % 2)
+            action = 2 * int(state[1] >= 0) if swing_up else int(rng.integers(4))
+            state, reward, *ends, _ = noisy.step(action)
+            expected, goal, *expected_ends, _ = plain.step(1 if action == 3 else action)
+            assert np.array_equal(state[:2], expected) and ends == expected_ends
+            assert reward == goal - 0.001 * (action == 3) and (state[2] != 0) == (action == 3)
+            shown += [state[2]] if action == 3 else []
+            paid += [reward] if goal else []
+            over = any(ends)
+    assert len(paid) == 10 and len(np.unique(shown)) == len(shown) > 500
+    assert kstest(shown, "uniform", args=(-1, 2)).pvalue > 0.01
+
+
 # --- Deep sea -----------------------------------------------------------------------------------
 
 
@@ -120,6 +162,25 @@ def test_returns_of_the_deep_sea(size):
     assert sorted(returns) == pytest.approx(sorted([*expected, 0.99]))
     triangle = {row * size + column for row in range(size) for column in range(row + 1)}
     assert visited == triangle | {size * size}
+
+
+def test_the_archive_of_the_noisy_deep_sea():
+    """It is entered in the first row alone, and left by no action; elsewhere all is as without."""
+    noisy, plain = gymnasium.make("NoisyDeepSea10-v0"), DeepSea(10)
+    noisy.reset(seed=0)
+    pages = []
+    for episode in range(200):
+        actions = list(itertools.islice(random_actions(noisy, episode), 10))
+        observations, rewards, terminated = play(noisy, actions)
+        assert terminated and len(rewards) == 10
+        if actions[0] == 2:
+            assert rewards == [-0.001] * 10 and min(observations[1:]) > 100
+            pages += observations[1:]
+        else:
+            expected = play(plain, [action % 2 for action in actions])
+            assert (observations, rewards, terminated) == expected
+    assert len(pages) > 500 and max(pages) < 1101
+    assert kstest(pages, "uniform", args=(101, 1000)).pvalue > 0.01
 
 
 # --- Hopper -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-# The claim ledger, for a study that has all the paper makes claims of.
+# The ledger, for a study that has all of the protocol's claims, or of its questions.
 
 
 rule claims:

@@ -13,7 +13,7 @@ from mace_rl.config.reading import merge, read_yaml, typed
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 from mace_rl.config.plugins import source_file
-from mace_rl.results import paper
+from mace_rl.results import paper, protocol
 from mace_rl.results.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
@@ -43,10 +43,11 @@ RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
 EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
 RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
-# The claim ledger is for a study that has all the paper makes claims of, and one bar for all.
 HAS_PAPERS = paper.has_all(study.environments, study.variants)
-TESTS_CLAIMS = HAS_PAPERS and bool(MEASURED.reference_return)
-CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"] if TESTS_CLAIMS else []
+# The ledger is for a study that has all of the protocol's claims or questions, and one bar for all.
+ASKS = bool(protocol.asked(study.environments, study.variants))
+CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"]
+CLAIMS = CLAIMS if ASKS and MEASURED.reference_return else []
 # The regret of a learned β only where the configuration asks for it.
 REGRET = ["regret"] if study.metrics.regret else []
 PICTURES = ["every_seed"]  # and what the configuration has the numbers for

@@ -40,7 +40,7 @@ rule table2:
 
 
 TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate", *REGRET]
-TABULATED += ["readings"] if CLAIMS else []  # seconds of work that only Table 1 is worth
+TABULATED += ["readings"] if HAS_PAPERS else []  # seconds of work that only Table 1 is worth
 
 
 # The pictures are no inputs: the page only names them.

@@ -77,7 +77,7 @@ onstart:
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments):
         logger.info(line)
-    if HAS_PAPERS and not TESTS_CLAIMS:
+    if ASKS and not CLAIMS:
         logger.info(
             "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
         )

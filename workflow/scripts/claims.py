@@ -1,4 +1,4 @@
-"""The claim ledger: what of the paper holds, by the rule in docs/method.md."""
+"""The ledger: what of the paper holds, and what of our own questions (docs/protocol.md)."""
 
 from job import job
 
@@ -11,6 +11,7 @@ with job("claims", snakemake.log[0]):
     from mace_rl.results.claims import ledger
     from mace_rl.results.metrics_table import BETAS, read_metrics
     from mace_rl.results.pages import claims_page
+    from mace_rl.results.protocol import asked
     from mace_rl.results.records import read_table
     from mace_rl.runs.provenance import read_record
 
@@ -18,7 +19,7 @@ with job("claims", snakemake.log[0]):
     settings = MetricsConfig.model_validate(params.settings)
     table = read_metrics(found.metrics, params.runs, settings)
     table = table.merge(read_table(found.betas, BETAS), how="left", validate="1:1")
-    claims = ledger(table, settings)
+    claims = ledger(table, settings, asked(table["env"], table["variant"]))
     hours = sum(read_record(Path(path))["seconds"] for path in found.records) / 3600
     cost = {"command": params.command, "runs": len(table), "core_hours": hours}
     whole = {"cost": cost, "claims": claims}

@@ -9,6 +9,15 @@ from gymnasium.envs.registration import WrapperSpec
 gymnasium.register(
     "SparseMountainCar-v0", "mace_rl.environments.tasks:SparseMountainCar", max_episode_steps=200
 )
+gymnasium.register(
+    "NoisyMountainCar-v0", "mace_rl.environments.tasks:NoisyMountainCar", max_episode_steps=200
+)
+gymnasium.register(
+    "NoisyDeepSea10-v0",
+    "mace_rl.environments.tasks:NoisyDeepSea",
+    max_episode_steps=10,
+    kwargs={"size": 10, "pages": 1000},
+)
 for size in (10, 20):
     gymnasium.register(
         f"DeepSea{size}-v0",

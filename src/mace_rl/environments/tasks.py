@@ -7,6 +7,8 @@
     CliffWalking200-v0              -13; what random actions find is the cliff, at -100 a fall
     SparseHopper-v0                 1 for every 0.5 m; falling forward does not get that far
     BarrenRegion-v0                 1; novelty without end lies elsewhere
+    NoisyMountainCar-v0             1; the same, as a television that an action switches on
+    NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
 
 Whatever an environment remembers beside its generator is of the current episode.
 """
@@ -26,6 +28,37 @@ class SparseMountainCar(MountainCarEnv):
         """Gymnasium's step, under another reward."""
         state, _, terminated, truncated, info = super().step(action)
         return state, float(terminated), terminated, truncated, info
+
+
+class NoisyMountainCar(SparseMountainCar):
+    """SparseMountainCar with a noisy television, which a fourth action watches.
+
+    Watching (3) is coasting, and costs 0.001. Observation: position and velocity as in Gymnasium,
+    then what is on: after watching a fresh uniform number in [-1, 1], otherwise 0; float32 [3].
+    """
+
+    WATCH, COAST = 3, 1
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        self.action_space = Discrete(4)
+        low, high = (np.append(x, np.float32(end)) for x, end in ((self.low, -1), (self.high, 1)))
+        self.observation_space = Box(low, high, dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Gymnasium's reset; the television is off."""
+        state, info = super().reset(seed=seed, options=options)
+        return np.append(state, np.float32(0)), info
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """SparseMountainCar's step, and the television."""
+        watching = action == self.WATCH
+        action = self.COAST if watching else action
+        state, reward, terminated, truncated, info = super().step(action)
+        shown = np.float32(self.np_random.uniform(-1, 1) if watching else 0)
+        return np.append(state, shown), reward - 0.001 * watching, terminated, truncated, info
 
 
 class DeepSea(gymnasium.Env):
@@ -69,6 +102,39 @@ class DeepSea(gymnasium.Env):
         bottom = self.row == self.size
         cell = self.size * self.size if bottom else self.row * self.size + self.column
         return cell, reward, bottom, False, {}
+
+
+class NoisyDeepSea(DeepSea):
+    """DeepSea with an archive of `pages` pages beside its start, full of news and without reward.
+
+    In the first row a third action leads into the archive, and the rest of the episode is spent
+    there: whatever the action, each step costs 0.001 and shows a page drawn anew. Elsewhere the
+    third action does what 0 does. An archive of 1000 pages has ten times as much news as 55 cells.
+
+    Observation: the number of the cell as in DeepSea, `size`² after the last step; then the pages.
+    """
+
+    def __init__(self, size: int, pages: int) -> None:
+        super().__init__(size)
+        self.cells, self.pages = size * size + 1, pages
+        self.observation_space = Discrete(self.cells + pages)
+        self.action_space = Discrete(3)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """To the top left."""
+        self.reading = False
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """One row down, or another page."""
+        self.reading |= action == 2 and self.row == 0
+        if not self.reading:
+            return super().step(action % 2)
+        self.row += 1
+        page = self.cells + int(self.np_random.integers(self.pages))
+        return page, -0.001, self.row == self.size, False, {}
 
 
 class MetresPassed(gymnasium.Wrapper):

@@ -20,7 +20,7 @@ from mace_rl.config.results import FigureConfig, MetricsConfig
 from mace_rl.report.animations import Animation
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.results import pages, tables
-from mace_rl.results.claims import FEWEST_SEEDS, LITERAL, POWER, ROBUST, VERDICTS
+from mace_rl.results.claims import FEWEST_SEEDS, POWER
 from mace_rl.results.figures import Look, quantity
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.pages import Data, Ledger
@@ -63,10 +63,9 @@ def page(
     environment.filters |= {"short": short, "duration": duration, "table": as_html}
     metrics, records = data["metrics"], making.records
     return environment.get_template(TEMPLATE.name).render(
-        claims=claims,
+        families=pages.families(claims),
         counted=pages.counted,
-        ways=(LITERAL, ROBUST),
-        verdicts=VERDICTS,
+        ways=pages.ways,
         fewest=FEWEST_SEEDS,
         power=POWER,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),

@@ -1,14 +1,13 @@
-"""Does what the paper claims hold? A verdict for each claim by the rule in docs/method.md.
+"""Does what the paper claims hold, and what of our own questions? The rule is in docs/protocol.md.
 
-A claim is made of parts, each a comparison of two variants; a part holds, fails or is open, and the
-claim is reproduced, contradicted or inconclusive. docs/method.md has the rule, and what was known
-when it was written.
+A part of a claim, a comparison of two variants, is shown, reversed, absent or open; of these comes
+the verdict on the claim.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,119 +15,20 @@ import scipy
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.paper import (
-    ACROBOT,
-    CARTPOLE,
-    ENVIRONMENTS,
-    FIXED,
-    FULL,
-    HOPPER,
-    PAPER_METRICS,
-    PAPER_TABLE1,
-    PPO,
-    VARIANTS,
-)
+from mace_rl.results.paper import FIXED, FULL, PAPER_METRICS, PAPER_TABLE1, PPO, VARIANTS
+from mace_rl.results.protocol import CORRELATION, Claim, Family, Part
 from mace_rl.results.statistics import (
+    equivalence,
     holm,
     probability_of_improvement,
     stratified_comparison,
 )
 
-CORRELATION = "stagnation_correlation"  # of betas.csv; over 0
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
 WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
-
-LITERAL, ROBUST = "by the paper's words and code", "robust"
-VERDICTS = ("reproduced", "contradicted", "inconclusive")
-
-
-class Part(NamedTuple):
-    """In these environments, on this metric: `variant` is better than `baseline`."""
-
-    environments: tuple[str, ...]  # of several the mean of the differences, as shares of everything
-    metric: str
-    variant: str
-    baseline: str | None  # None: over 0
-
-
-@dataclass(frozen=True)
-class Claim:
-    """What the paper says, and of which parts that is made, by how it is measured."""
-
-    name: str
-    statement: str
-    parts: Mapping[str, tuple[Part, ...]]
-    paper: tuple[str, int] | None = None  # the environment and column of the paper's Table 1
-
-
-def _over_both(variant: str, metric: str, *environments: str) -> tuple[Part, ...]:
-    """`variant` over the two others, in each environment."""
-    others = [name for name in VARIANTS if name != variant]
-    return tuple(Part((env,), metric, variant, other) for env in environments for other in others)
-
-
-def _speed(name: str, environment: str, statement: str, column: int) -> Claim:
-    """A claim that full is the first in a column of the paper's Table 1."""
-    names = [
-        ("sample_efficiency", "sample_efficiency_common"),
-        ("convergence_steps_public_code", "convergence_steps"),
-    ][column]
-    literal, robust = (_over_both(FULL, metric, environment) for metric in names)
-    return Claim(name, statement, {LITERAL: literal, ROBUST: robust}, (environment, column))
-
-
-def _same(parts: tuple[Part, ...]) -> dict[str, tuple[Part, ...]]:
-    return {LITERAL: parts, ROBUST: parts}
-
-
-CLAIMS = (
-    _speed("C1", ACROBOT, "Acrobot: the learned β has the best sample efficiency", 0),
-    _speed("C2", ACROBOT, "Acrobot: the learned β converges first", 1),
-    _speed("C3", HOPPER, "Hopper: the learned β has the best sample efficiency", 0),
-    _speed("C4", HOPPER, "Hopper: the learned β converges first", 1),
-    _speed("C5", CARTPOLE, "CartPole: the learned β has the best sample efficiency", 0),
-    Claim(
-        "C6",
-        "CartPole: the fixed β converges first and ends slightly above the learned one",
-        {
-            how: (
-                *_over_both(FIXED, metric, CARTPOLE),
-                Part((CARTPOLE,), "final_return", FIXED, FULL),
-            )
-            for how, metric in (
-                (LITERAL, "convergence_steps_public_code"),
-                (ROBUST, "convergence_steps"),
-            )
-        },
-        (CARTPOLE, 1),
-    ),
-    Claim(
-        "C7",
-        "Acrobot and Hopper: the learned β ends above both others",
-        _same(_over_both(FULL, "final_return", ACROBOT, HOPPER)),
-    ),
-    Claim(
-        "C8",
-        "Over all environments the learned β outperforms both others",
-        {
-            how: tuple(Part(ENVIRONMENTS, metric, FULL, other) for other in (PPO, FIXED))
-            for how, metric in ((LITERAL, "sample_efficiency"), (ROBUST, "area_under_curve"))
-        },
-    ),
-    Claim(
-        "C9",
-        "β rises when progress stalls and falls when learning advances",
-        _same(tuple(Part((env,), CORRELATION, FULL, None) for env in ENVIRONMENTS)),
-    ),
-    Claim(
-        "C10",
-        "CartPole: the learned β has the steepest initial curve",
-        _same(_over_both(FULL, "early_return", CARTPOLE)),
-    ),
-)
 
 
 @dataclass
@@ -151,36 +51,42 @@ class Finding:
     detectable: float  # what these seeds show with a power of `POWER`, before correction
     worth_mentioning: float
     in_paper: float  # the same difference in the paper's Table 1; NaN where that has none
+    p_equivalent: float  # that the difference is not smaller than what is worth mentioning
     p_holm: float = np.nan
-    outcome: str = ""  # holds, fails or open
+    p_equivalent_holm: float = np.nan
+    outcome: str = ""  # shown, reversed, absent or open
 
 
-def ledger(table: pd.DataFrame, settings: MetricsConfig) -> list[dict[str, Any]]:
+def ledger(
+    table: pd.DataFrame, settings: MetricsConfig, families: Sequence[Family]
+) -> list[dict[str, Any]]:
     """A record per claim: statement, what the paper's table says, verdicts and `Finding`s.
 
-    table: the frame of metrics.csv with a column `CORRELATION`, and with the paper's environments
+    table: the frame of metrics.csv with a column `CORRELATION`, and with the families' environments
     and variants; seeds may differ between environments, not between variants. Of one seed there are
     no intervals and no tests: NaN.
     """
-    found = {
-        how: [
-            [_find(part, claim, table, settings) for part in claim.parts[how]] for claim in CLAIMS
-        ]
-        for how in (LITERAL, ROBUST)
-    }
-    for of_claims in found.values():
-        _judge(list(chain.from_iterable(of_claims)))
-    return [
-        {"claim": claim.name, "statement": claim.statement, "paper": _paper(claim)}
-        | {
-            how: {
-                "verdict": verdict([finding.outcome for finding in of_claims[number]]),
-                "parts": [_record(finding) for finding in of_claims[number]],
-            }
-            for how, of_claims in found.items()
-        }
-        for number, claim in enumerate(CLAIMS)
+    return list(chain.from_iterable(_answers(table, settings, family) for family in families))
+
+
+def _answers(table: pd.DataFrame, settings: MetricsConfig, family: Family) -> list[dict[str, Any]]:
+    """The records of one family."""
+    records: list[dict[str, Any]] = [
+        {"family": family.title, "claim": claim.name, "statement": claim.statement}
+        | {"paper": _paper(claim)}
+        for claim in family.claims
     ]
+    for how in family.claims[0].parts:
+        found = [
+            [_find(part, claim, table, settings) for part in claim.parts[how]]
+            for claim in family.claims
+        ]
+        _judge(list(chain.from_iterable(found)))
+        for record, findings in zip(records, found, strict=True):
+            answer = verdict([finding.outcome for finding in findings])
+            parts = [_record(finding) for finding in findings]
+            record[how] = {"outcome": answer, "verdict": family.words[answer], "parts": parts}
+    return records
 
 
 def _record(finding: Finding) -> dict[str, Any]:
@@ -190,36 +96,47 @@ def _record(finding: Finding) -> dict[str, Any]:
 
 
 def verdict(outcomes: Sequence[str]) -> str:
-    """Of a claim, from what its parts came out as."""
-    if "fails" in outcomes:
-        return "contradicted"
-    return "reproduced" if set(outcomes) == {"holds"} else "inconclusive"
+    """Of a claim, from what its parts came out as; in the words of parts."""
+    found = set(outcomes)
+    if found == {"shown"}:
+        return "shown"
+    if "reversed" in found and "shown" not in found:
+        return "reversed"
+    return "absent" if found & {"reversed", "absent"} else "open"
 
 
 def outcome(finding: Finding) -> str:
-    """Of one part, whose `p_holm` is known."""
+    """Of one part, whose p values are corrected."""
     if finding.seeds < FEWEST_SEEDS:
         return "open"
+    if finding.p_equivalent_holm < LEVEL:
+        return "absent"
     if finding.p_holm < LEVEL:
-        return "holds" if finding.difference > 0 else "fails"
-    return "fails" if finding.high < finding.worth_mentioning else "open"
+        return "shown" if finding.difference > 0 else "reversed"
+    return "open"
 
 
 def _judge(findings: list[Finding]) -> None:
     """Correct the p values of all parts together, and say what each came out as.
 
-    A part that one seed leaves without a p value counts as one of 1.
+    Those for a difference and those against one are corrected apart. A part that one seed leaves
+    without a p value counts as one of 1.
     """
-    p_values = np.array([finding.p_value for finding in findings])
-    untested = np.isnan(p_values)
-    corrected = np.where(untested, np.nan, holm(np.where(untested, 1.0, p_values).tolist()))
-    for finding, p_holm in zip(findings, corrected, strict=True):
-        finding.p_holm = float(p_holm)
+    different = _corrected([finding.p_value for finding in findings])
+    equivalent = _corrected([finding.p_equivalent for finding in findings])
+    for finding, *p_values in zip(findings, different, equivalent, strict=True):
+        finding.p_holm, finding.p_equivalent_holm = p_values
         finding.outcome = outcome(finding)
 
 
+def _corrected(p_values: Sequence[float]) -> list[float]:
+    """Holm's p values; NaN where there was none."""
+    adjusted = holm([1.0 if np.isnan(p) else p for p in p_values])
+    return [p if np.isnan(p) else float(q) for p, q in zip(p_values, adjusted, strict=True)]
+
+
 def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
-    """Estimates and test of one part of a claim."""
+    """Estimates and tests of one part of a claim."""
     metrics = {metric.name: metric for metric in all_metrics(settings)}
     both = table[table["variant"].isin([part.variant, part.baseline])]
     runs = {env: both[both["env"] == env] for env in part.environments}
@@ -236,6 +153,8 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
     difference, low, high, p_value = map(float, compared)
     improved = probability_of_improvement(columns, *how, np.random.default_rng(seed))
     chance, lowest, highest = (bound.item() for bound in improved)
+    margin = WORTH_MENTIONING * everything[0]
+    flips = settings.bootstrap_repetitions, np.random.default_rng(seed)
     return Finding(
         *part,
         unit,
@@ -243,8 +162,9 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
         *(difference, low, high, p_value),
         *(chance, lowest, highest),
         _detectable(differences),
-        WORTH_MENTIONING * everything[0],
+        margin,
         _in_paper(part, claim) if unit == "episodes" else np.nan,
+        equivalence(differences, margin, *flips),
     )
 
 

@@ -10,9 +10,10 @@ import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results import tables
-from mace_rl.results.claims import LITERAL, POWER, ROBUST, VERDICTS
+from mace_rl.results.claims import POWER
 from mace_rl.results.comparisons import ALL
 from mace_rl.results.metrics_table import BETAS, read_metrics
+from mace_rl.results.protocol import FAMILIES, WAYS
 from mace_rl.results.records import read_table
 from mace_rl.results.renderings import markdown
 from mace_rl.results.summary import from_to
@@ -37,14 +38,13 @@ def read_data(
 
 def claims_page(claims: Ledger, origin: str) -> str:
     """claims.md, from the records of `claims.ledger`; `origin` says how it was made."""
-    intro = f"# Does it hold?\n\n{origin} The rule of the verdicts: docs/method.md.\n\n"
-    return intro + markdown(tables.verdicts(claims)) + "".join(_parts(claims))
+    return f"# Does it hold?\n\n{origin}\n" + "".join(_ledger(claims))
 
 
 def _parts(claims: Ledger) -> Iterator[str]:
-    for how in (LITERAL, ROBUST):
+    for how in ways(claims):
         yield (
-            f"\n## Part by part: {how}\n\n"
+            f"\n### Part by part: {how}\n\n"
             "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
             " *P*: that a run of the first is better. *Margin*: what counts as an advantage worth"
             f" mentioning. *Detectable*: the smallest that these seeds show with a power of"
@@ -53,10 +53,25 @@ def _parts(claims: Ledger) -> Iterator[str]:
         yield markdown(tables.parts(claims, how, {}))
 
 
+def families(claims: Ledger) -> dict[str, Ledger]:
+    """The records of each family that the ledger has, by its title."""
+    return {
+        family.title: own
+        for family in FAMILIES
+        if (own := [claim for claim in claims if claim["family"] == family.title])
+    }
+
+
+def ways(claims: Ledger) -> list[str]:
+    """In which ways the claims of one family are measured."""
+    return [how for how in WAYS if how in claims[0]]
+
+
 def counted(claims: Ledger, how: str) -> str:
-    """How many claims have which verdict, in words."""
+    """How many claims of one family have which verdict, in words."""
+    words = next(family.words for family in FAMILIES if family.title == claims[0]["family"])
     counts = Counter(claim[how]["verdict"] for claim in claims)
-    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words.values())
 
 
 def tables_page(
@@ -90,10 +105,11 @@ def _section(title: str, note: str, frame: pd.DataFrame) -> str:
 
 
 def _ledger(claims: Ledger) -> Iterator[str]:
-    verdicts = "; ".join(f"{how}: {counted(claims, how)}" for how in (LITERAL, ROBUST))
-    note = f"Of the paper's {len(claims)} claims, {verdicts}. The rule: docs/method.md."
-    yield _section("Does it hold?", note, tables.verdicts(claims))
-    yield from _parts(claims)
+    for title, own in families(claims).items():
+        verdicts = "; ".join(f"{how}: {counted(own, how)}" for how in ways(own))
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/protocol.md."
+        yield _section(title.capitalize(), note, tables.verdicts(own))
+        yield from _parts(own)
 
 
 def _means(data: Data, settings: MetricsConfig) -> Iterator[str]:

@@ -12,10 +12,11 @@ import pandas as pd
 
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.aggregate import SCORED
-from mace_rl.results.claims import CONFIDENCE, LITERAL, ROBUST, WORTH_MENTIONING
+from mace_rl.results.claims import CONFIDENCE, WORTH_MENTIONING
 from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
 from mace_rl.results.metrics import METRICS
 from mace_rl.results.paper import FIXED, FULL, PPO
+from mace_rl.results.protocol import FROZEN, WAYS, WITHOUT_MEMORY
 from mace_rl.results.statistics import interval
 from mace_rl.results.tables import SOLVED
 
@@ -24,14 +25,15 @@ if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
 
 CONSTANT, LEARNED, OTHER = "constant", "learned", "other"
 METRIC_LABELS = {metric.name: metric.label for metric in METRICS}
-SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β"}  # the paper's variants
+SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β", FROZEN: "frozen LSTM"}
+SHORT |= {WITHOUT_MEMORY: "without memory"}  # others are called what they are
 # Of parts, and of the verdicts alike; from seaborn's palette that the colour-blind can tell apart.
 OUTCOMES = {
-    "holds": ("#029e73", "the part holds"),
-    "open": ("#767676", "the part is open"),
-    "fails": ("#d55e00", "the part fails"),
+    "shown": ("#029e73", "shown"),
+    "open": ("#767676", "open"),
+    "absent": ("#0173b2", "absent: no effect worth mentioning"),
+    "reversed": ("#d55e00", "reversed"),
 }
-VERDICTS = {"reproduced": "holds", "inconclusive": "open", "contradicted": "fails"}
 INK = "#262626"  # as seaborn draws axes
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
@@ -158,22 +160,23 @@ def draw_solved(table: pd.DataFrame, look: Look) -> "Figure":
 def forest(ledger: Sequence[Mapping[str, Any]], settings: MetricsConfig) -> pd.DataFrame:
     """Every part of every claim of claims.json, measured in what would be worth mentioning.
 
-    Columns: measured (`LITERAL` or `ROBUST`), claim, statement, verdict (of the claim), part (what
-    tells it from the claim's others), metric, seeds, difference, low, high, paper (the same in the
-    paper's Table 1; NaN where that has none), outcome (of the part). More is in the claim's favour.
+    Columns: measured (one of `WAYS`), claim, statement, verdict and answer (of the claim, in its
+    own words and in those of parts), part (what tells it from the claim's others), metric, seeds,
+    difference, low, high, paper (the same in the paper's Table 1; NaN where that has none), outcome
+    (of the part). More is in the claim's favour.
     """
     rows = []
-    for how in (LITERAL, ROBUST):
-        for claim in ledger:
-            parts = claim[how]["parts"]
-            common = (how, claim["claim"], claim["statement"], claim[how]["verdict"])
+    for how in WAYS:
+        for claim in (claim for claim in ledger if how in claim):
+            parts, answer = claim[how]["parts"], claim[how]["outcome"]
+            common = (how, claim["claim"], claim["statement"], claim[how]["verdict"], answer)
             for part in parts:
                 values = [part[key] for key in ("difference", "low", "high", "in_paper")]
                 unit = part["worth_mentioning"]
                 scaled = [np.nan if value is None else value / unit for value in values]
                 measured = (_what(part, parts), part["metric"], part["seeds"])
                 rows.append((*common, *measured, *scaled, part["outcome"]))
-    columns = ["measured", "claim", "statement", "verdict", "part", "metric", "seeds"]
+    columns = ["measured", "claim", "statement", "verdict", "answer", "part", "metric", "seeds"]
     columns += ["difference", "low", "high", "paper", "outcome"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -183,7 +186,8 @@ def _what(part: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> str:
     differ = {key for key in ("environments", "metric") if any(p[key] != part[key] for p in parts)}
     words = [name.partition("-")[0] for name in part["environments"] if "environments" in differ]
     words += [METRIC_LABELS[part["metric"]].lower()] if "metric" in differ else []
-    words += [f"over {SHORT[part['baseline']]}"] if part["baseline"] else []
+    baseline = part["baseline"]
+    words += [f"over {SHORT.get(baseline, baseline.replace('beta_', 'β = '))}"] if baseline else []
     return ", ".join(words)
 
 
@@ -210,13 +214,15 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
                 axes.plot(parts["difference"], parts["place"], "o", **dots)
             axes.plot(own["paper"], own["place"], "d", **hollow)
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
-            axes.axvline(1, color=INK, linewidth=0.8, linestyle="--", zorder=1)
+            for margin in (-1, 1):
+                axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
             axes.set_xlabel(f"Difference in the claim's favour\n(1: {UNIT})")
             for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
-                first, last, verdict = claim["place"].min(), claim["place"].max(), claim["verdict"]
-                colour, _ = OUTCOMES[VERDICTS[verdict.iloc[0]]]
-                axes.text(reach, first, verdict.iloc[0], color=colour, ha="right", **small)
+                first, last = claim["place"].min(), claim["place"].max()
+                (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
+                colour, _ = OUTCOMES[answer]
+                axes.text(reach, first, verdict, color=colour, ha="right", **small)
                 for panel in (names, axes):
                     grey = "0.9" if shade % 2 else "white"
                     panel.axhspan(first - 0.5, last + 0.5, color=grey, zorder=0)

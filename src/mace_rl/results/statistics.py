@@ -78,16 +78,58 @@ def paired_comparison(
     low, high = mean_interval(differences, confidence, repetitions, generator)
     if len(differences) == 1:
         return PairedComparison(mean, low, high, np.full_like(mean, np.nan))
+    return PairedComparison(mean, low, high, _sign_flips(differences, repetitions, generator))
+
+
+def equivalence(
+    differences: Sequence[np.ndarray],
+    margin: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> float:
+    """p value that the mean over strata of the mean difference is not within ± `margin`.
+
+    Two one-sided sign-flip tests (Schuirmann 1987), that it is above -margin and that it is below
+    margin: the larger of their p values. differences: as of `stratified_comparison`. NaN with one
+    seed in a stratum.
+    """
+    if min(map(len, differences)) == 1:
+        return np.nan
+    above, below = (
+        _weighted([values - end for values in differences]) for end in (-margin, margin)
+    )
+    return max(
+        float(_sign_flips(above, repetitions, generator, "greater")),
+        float(_sign_flips(below, repetitions, generator, "less")),
+    )
+
+
+def _sign_flips(
+    values: np.ndarray,
+    repetitions: int,
+    generator: np.random.Generator,
+    alternative: str = "two-sided",
+) -> np.ndarray:
+    """p value of the sign-flip test of each mean over the first axis, exact where it can be."""
     tested = scipy.stats.permutation_test(
-        (differences,),
+        (values,),
         np.mean,
         permutation_type="samples",
+        alternative=alternative,
         n_resamples=repetitions,
         batch=BATCH,
         rng=generator,
         vectorized=True,
     )
-    return PairedComparison(mean, low, high, tested.pvalue)
+    return tested.pvalue
+
+
+def _weighted(differences: Sequence[np.ndarray]) -> np.ndarray:
+    """The differences of all strata, weighted: their mean is the mean of the strata's means."""
+    total = sum(len(values) for values in differences)
+    return np.concatenate(
+        [values * total / (len(differences) * len(values)) for values in differences]
+    )
 
 
 def stratified_comparison(
@@ -104,11 +146,7 @@ def stratified_comparison(
     """
     if len(differences) == 1:
         return paired_comparison(differences[0], confidence, repetitions, generator)
-    total = sum(len(values) for values in differences)
-    weighted = np.concatenate(  # whose mean is the mean of the strata's means
-        [values * total / (len(differences) * len(values)) for values in differences]
-    )
-    tested = paired_comparison(weighted, confidence, repetitions, generator)
+    tested = paired_comparison(_weighted(differences), confidence, repetitions, generator)
     smallest = min(len(values) for values in differences)
     if smallest == 1:
         return tested._replace(low=np.array(np.nan), high=np.array(np.nan))

@@ -12,9 +12,9 @@ import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.config.results import MetricsConfig
-from mace_rl.results.claims import LITERAL, ROBUST
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.paper import PAPER_METRICS
+from mace_rl.results.protocol import WAYS
 from mace_rl.results.readings import in_order, ranked, title
 from mace_rl.results.renderings import Cell, Value, estimate, number
 from mace_rl.results.statistics import interval
@@ -217,17 +217,19 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 
 def verdicts(claims: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """The claim ledger: a verdict for each claim, in both ways to measure."""
+    """A verdict for each claim of one family, in each way to measure it."""
+    ways = [how for how in WAYS if how in claims[0]]
     rows = [
         [
             claim["claim"],
             claim["statement"],
-            *(Cell([Value(claim[how]["verdict"], best=True)]) for how in (LITERAL, ROBUST)),
+            *(Cell([Value(claim[how]["verdict"], best=True)]) for how in ways),
             claim["paper"],
         ]
         for claim in claims
     ]
-    return pd.DataFrame(rows, columns=["", "claim", LITERAL, ROBUST, "the paper's Table 1"])
+    frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
+    return frame if any(claim["paper"] for claim in claims) else frame.iloc[:, :-1]
 
 
 def parts(claims: Sequence[Mapping[str, Any]], how: str, names: Mapping[str, str]) -> pd.DataFrame:
@@ -247,12 +249,13 @@ def parts(claims: Sequence[Mapping[str, Any]], how: str, names: Mapping[str, str
                     _number(part["seeds"]),
                     _estimate(part, "difference", digits, ends=""),
                     _number(part["p_holm"], 3),
+                    _number(part["p_equivalent_holm"], 3),
                     _estimate(part, "probability", 2),
                     *(_number(part[name], digits) for name in margins),
                     part["outcome"],
                 ]
             )
-    heads = ["", "environment", "metric", "over", "n", "difference", "p (Holm)", "P", "paper"]
+    heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
 
 
