@@ -37,12 +37,12 @@ def fused(module: ir.Module) -> ir.Function:
     )
 
 
-def everywhere(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    """A vector of one float."""
-    undefined = ir.Constant(VECTOR, ir.Undefined)
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+def everywhere(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> ir.Value:
+    """A vector of one number."""
+    undefined = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, undefined, lanes)
+    places = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+    return builder.shuffle_vector(first, undefined, places)
 
 
 def tile(rows: int, vectors: int) -> Any:
