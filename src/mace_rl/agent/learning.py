@@ -120,3 +120,27 @@ def improve_values(observations, returns, epochs, ends, sizes, optimiser):
 def value_grad(value, target, count):
     """Gradient of the mean of `count` squared errors at one of the values."""
     return np.float32(2 / count) * (value - target)
+
+
+@kernel
+def policy_gradients(observations, actions, weights, parameters, sizes, log_std_at):
+    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n].
+
+    parameters: the policy's; the other arguments as in `improve_policy`.
+    """
+    log_std, outs = parameters[log_std_at:], sizes[-1]
+    activations, room = room_for(BLOCK, sizes), room_for(BLOCK, sizes)
+    back, sums = transposed(parameters, sizes), np.zeros(3)
+    gradients = np.zeros((len(weights), len(parameters)), np.float32)
+    for start in range(0, len(observations), BLOCK):
+        end = min(start + BLOCK, len(observations))
+        seen, done = observations[start:end], actions[start:end]
+        outputs = forward(seen, parameters, sizes, activations)
+        grad = np.zeros_like(outputs)
+        for k in range(len(weights)):
+            log_prob_gradient(
+                *(outputs[:, :outs], log_std, done, weights[k, start:end], 0.0),
+                *(grad[:, :outs], gradients[k, log_std_at:], sums),
+            )
+            backward(seen, activations, grad, back, sizes, gradients[k], room)
+    return gradients
