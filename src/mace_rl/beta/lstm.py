@@ -58,7 +58,7 @@ class TorchMetaNetwork(TorchNetwork):
     def forward(self, inputs: list[np.ndarray]) -> Trace:  # type: ignore[override]
         """See `Network`; the outputs are one logit for each sequence, [B]."""
         outputs = torch.cat([self._module(torch.from_numpy(sequence)) for sequence in inputs])
-        return Trace(outputs.detach().numpy(), outputs)
+        return Trace(outputs.detach().numpy(), (outputs, inputs))
 
 
 class CompiledMetaNetwork:
