@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from mace_rl.agent.elementary import exp, log, tanh
-from mace_rl.agent.products import add_product, by_tiles, dot, padded, product
+from mace_rl.agent.products import add_product, address, by_tiles, dot, padded, product
 
 # Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
 kernel = njit(cache=True, error_model="numpy")
@@ -38,20 +38,20 @@ def forward(inputs, parameters, sizes, activations):
 
     inputs: [N, in]; activations: from `room_for` at least N, filled with what every layer puts out.
     """
-    below, below_row = inputs.ctypes.data, inputs.shape[1]
-    weights, end, width = parameters.ctypes.data, 0, 0
+    below, below_row = address(inputs), inputs.shape[1]
+    weights, end, width = address(parameters), 0, 0
     for layer in range(len(sizes) - 1):
         ins, width = sizes[layer], padded(sizes[layer + 1])
         bias = weights + 4 * ins * width
         above = activations[end : end + len(inputs) * width]
         by_tiles(
             *(below, below_row, 1, weights, width, bias, 0),
-            *(above.ctypes.data, width, len(inputs), width, ins),
+            *(address(above), width, len(inputs), width, ins),
         )
         if layer < len(sizes) - 2:
             for k in range(len(above)):
                 above[k] = tanh(above[k])
-        below, below_row, weights = above.ctypes.data, width, bias + 4 * width
+        below, below_row, weights = address(above), width, bias + 4 * width
         end += len(above)
     return activations[end - len(inputs) * width : end].reshape(len(inputs), width)
 

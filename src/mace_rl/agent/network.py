@@ -134,7 +134,9 @@ class CompiledMLP:
         return kernels.network_gradient(*given, inward), inward[:, :inputs]
 
     def move_to(self, memory: np.ndarray) -> None:
-        """See `Network`."""
+        """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""
+        if memory.dtype != np.float32 or not memory.flags.c_contiguous:
+            raise ValueError(f"parameters have to be contiguous float32, not {memory.dtype}")
         memory[:] = self.parameters
         self.parameters = memory
 
