@@ -43,7 +43,7 @@ def make(kind: str, seed=0, engine="compiled", actions="discrete", **settings) -
     space, generator = Box(-9, 9, (SIZE,)), np.random.default_rng(seed)
     if kind == "icm":
         config = ICMBonus(kind=kind, **settings)
-        return IntrinsicCuriosityModule(config, space, ACTIONS[actions], SIZE, generator)
+        return IntrinsicCuriosityModule(config, engine, space, ACTIONS[actions], SIZE, generator)
     if kind == "rnd":
         config = RNDBonus(kind=kind, **settings)
         return RandomNetworkDistillation(config, engine, space, SIZE, generator)
@@ -113,25 +113,27 @@ def test_rnd_by_autograd(engine):
 
 
 @pytest.mark.parametrize("actions", ACTIONS)
-def test_icm_by_autograd(actions):
+@pytest.mark.parametrize("engine", ENGINES)
+def test_icm_by_autograd(engine, actions):
     """Its joint loss (equation 7) written out from its three networks, in float64."""
-    icm = make("icm", actions=actions, forward_weight=0.3, scale=4.0)
+    icm = make("icm", engine=engine, actions=actions, forward_weight=0.3, scale=4.0)
     episode = wander(1, actions=actions)
-    parts = copy.deepcopy(icm.network.module()).double()
+    features, inverse_model, forward_model = twins = [
+        Twin(network) for network in (icm.features, icm.inverse_model, icm.forward_model)
+    ]
     seen = torch.from_numpy(np.clip(episode.observations, -5, 5)).double()
-    before, after = parts.features(seen[:-1]), parts.features(seen[1:])
-    guess = parts.inverse_model(torch.cat([before, after], 1))
+    before, after = features(seen[:-1]), features(seen[1:])
+    guess = inverse_model(torch.cat([before, after], 1))
     if actions == "discrete":
         taken = torch.eye(3, dtype=torch.float64)[episode.actions]
         inverse = cross_entropy(guess, torch.from_numpy(episode.actions))
     else:  # as the environment took it: within its bounds
         taken = torch.from_numpy(episode.actions.clip(-1, 1))
         inverse = ((guess - taken) ** 2).sum() / 2 / len(taken)
-    errors = ((parts.forward_model(torch.cat([before, taken], 1)) - after) ** 2).sum(1) / 2
+    errors = ((forward_model(torch.cat([before, taken], 1)) - after) ** 2).sum(1) / 2
     np.testing.assert_allclose(icm.bonus(episode).reward, 4 * errors.detach(), rtol=1e-4)
     loss = 0.7 * inverse + 0.3 * errors.mean()
-    expected = torch.autograd.grad(loss, list(parts.parameters()))
-    expected = np.concatenate([gradient.numpy().ravel() for gradient in expected])
+    expected = np.concatenate([twin.gradient(loss) for twin in twins])
     found = icm.gradient(icm.inputs(episode))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
 

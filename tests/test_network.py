@@ -78,6 +78,14 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
         assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
         added = laid_out(one, [np.ones_like(part) for part in gradients]) == 0
         assert (found[added] == 0).all() and (one.parameters[added] == 0).all()
+        if not several:
+            seen = torch.from_numpy(inputs).double().requires_grad_()
+            (double(seen) * torch.from_numpy(grad_outputs)).sum().backward()
+            again, inward = one.gradients(trace, grad_outputs.astype(np.float32))
+            np.testing.assert_array_equal(again, found)
+            tolerance = 1e-4 * seen.grad.abs().max().item()
+            np.testing.assert_allclose(inward, seen.grad, rtol=1e-3, atol=tolerance)
+            assert inward.dtype == np.float32
         assert found.shape == one.parameters.shape == flat.shape
         other = type(one)(make(np.random.default_rng(1)))
         held = other.parameters
@@ -85,6 +93,13 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
         assert (other.parameters == one.parameters).all() and other.parameters is held
         again = answers(copy.deepcopy(one.module())).detach()
         np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
+
+
+def test_parameters_in_another_precision_are_refused():
+    """Compiled code would read them as other numbers."""
+    compiled = CompiledMLP(mlp([3, 5, 2], 1.0, np.random.default_rng(0)))
+    with pytest.raises(ValueError, match="float32, not float64"):
+        compiled.move_to(np.zeros(len(compiled.parameters)))
 
 
 def test_both_engines_start_alike(run_config):

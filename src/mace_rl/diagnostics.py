@@ -8,7 +8,7 @@ import numpy as np
 from mace_rl.agent.advantages import mean, variance
 from mace_rl.agent.ppo import Update
 from mace_rl.agent.products import dot
-from mace_rl.experience import Experience, extrinsic_part, intrinsic_part
+from mace_rl.experience import Experience
 from mace_rl.results.records import UpdateRecord
 
 
@@ -37,8 +37,8 @@ def diagnose(
         return mean(values)
 
     has_bonus = rollout[0].bonus is not None
-    own = stacked(extrinsic_part(item) for item in rollout)
-    added = stacked(item.beta * intrinsic_part(item) for item in rollout)
+    own = stacked(item.extrinsic_part for item in rollout)
+    added = stacked(item.intrinsic_share for item in rollout)
     extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(

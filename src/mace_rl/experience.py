@@ -1,6 +1,7 @@
 """What an update learns from: episodes with their bonus, advantages and returns."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +24,21 @@ class Experience:
     extrinsic_scale: float  # what the advantages are divided by where they are added up; or 1
     intrinsic_scale: float
 
+    @cached_property
+    def extrinsic_part(self) -> np.ndarray:
+        """What the total advantage has of the extrinsic one: it, or in units of its scale."""
+        return self.extrinsic_advantages / self.extrinsic_scale
+
+    @cached_property
+    def intrinsic_part(self) -> np.ndarray:
+        """What β weighs in the total advantage: the intrinsic one, or in units of its scale."""
+        return self.intrinsic_advantages / self.intrinsic_scale
+
+    @cached_property
+    def intrinsic_share(self) -> np.ndarray:
+        """What β makes of it."""
+        return self.beta * self.intrinsic_part
+
 
 def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
     """Observations, [N, observation], and actions of the episodes, one after the other."""
@@ -35,21 +51,9 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(pieces).astype(np.float32)
 
 
-def extrinsic_part(item: Experience) -> np.ndarray:
-    """What the total advantage has of the extrinsic one, [T]: it, or in units of its scale."""
-    return item.extrinsic_advantages / item.extrinsic_scale
-
-
-def intrinsic_part(item: Experience) -> np.ndarray:
-    """What β weighs in the total advantage, [T]: the intrinsic one, or in units of its scale."""
-    return item.intrinsic_advantages / item.intrinsic_scale
-
-
 def total_advantages(rollout: list[Experience]) -> np.ndarray:
     """A_E + β A_I of every step, float64 [N]."""
-    return np.concatenate(
-        [extrinsic_part(item) + item.beta * intrinsic_part(item) for item in rollout]
-    )
+    return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
 
 
 def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
@@ -57,6 +61,6 @@ def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
     parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
     start = 0
     for part, item in zip(parts, rollout, strict=True):
-        part[start : start + len(item.episode)] = intrinsic_part(item)
+        part[start : start + len(item.episode)] = item.intrinsic_part
         start += len(item.episode)
     return list(parts)

@@ -73,17 +73,18 @@ def intrinsic_reward(
 ) -> IntrinsicReward | None:
     """What β weighs: the curiosity bonus with its memory and novelty, or another; None in PPO."""
     space, size = environment.observation_space, environment.observation_size
-    actions, generator = environment.action_space, streams["bonus"]
+    actions, generator, engine = environment.action_space, streams["bonus"], config.engine
     match config.bonus:
         case None:
             return None
         case CuriosityBonus():
             assert config.novelty is not None  # as above
-            return Curiosity(config.memory, config.novelty, config.engine, space, size, streams)
+            return Curiosity(config.memory, config.novelty, engine, space, size, streams)
         case ICMBonus():
-            return IntrinsicCuriosityModule(config.bonus, space, actions, size, generator)
+            of = config.bonus, engine, space, actions, size, generator
+            return IntrinsicCuriosityModule(*of)
         case RNDBonus():
-            return RandomNetworkDistillation(config.bonus, config.engine, space, size, generator)
+            return RandomNetworkDistillation(config.bonus, engine, space, size, generator)
         case HashCountsBonus():
             return HashCounts(config.bonus, space, size, generator)
         case CustomBonus(estimator=estimator, arguments=arguments):

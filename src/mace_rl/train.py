@@ -30,8 +30,6 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
 from mace_rl.experience import (
     Experience,
-    extrinsic_part,
-    intrinsic_part,
     intrinsic_parts,
     joined,
     steps,
@@ -159,7 +157,7 @@ class Trainer:
         if self.controller is None or not self.controller.learns:
             return None
         centred = self.config.ppo.centre_advantages
-        extrinsic = np.concatenate([extrinsic_part(item) for item in rollout])
+        extrinsic = np.concatenate([item.extrinsic_part for item in rollout])
         if centred:
             extrinsic -= mean(extrinsic)
         total = total_advantages(rollout)
@@ -167,7 +165,7 @@ class Trainer:
         gradient, *changes = self.ppo.policy_gradients(*steps(rollout), [extrinsic, *changes])
         adam = self.ppo.optimisers["actor"]
         effects = [
-            Effect(adam.preconditioned(change), root_mean_square(intrinsic_part(item)))
+            Effect(adam.preconditioned(change), root_mean_square(item.intrinsic_part))
             for change, item in zip(changes, rollout, strict=True)
         ]
         return self.controller.learn(gradient, root_mean_square(extrinsic), effects)

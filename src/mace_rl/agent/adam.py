@@ -49,8 +49,7 @@ class Adam:
         """
         if self.decayed[1] == 1:
             return direction
-        unbiased = self.square / np.float32(1 - self.decayed[1])
-        return direction / (np.sqrt(unbiased) + np.float32(EPSILON))
+        return preconditioned(direction, self.square, np.float32(1 - self.decayed[1]))
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters and the optimiser's moments."""
@@ -83,3 +82,12 @@ def step(gradient, parameters, mean, square, decayed, learning_rate, max_gradien
         square[i] = keep_square * square[i] + add_square * slope * slope
         parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(EPSILON))
     return norm
+
+
+@kernel
+def preconditioned(direction, square, unbiased):
+    """`Adam.preconditioned` with the running estimate of squares, which is so much too small."""
+    result = np.empty_like(direction)
+    for i in range(len(result)):
+        result[i] = direction[i] / (math.sqrt(square[i] / unbiased) + np.float32(EPSILON))
+    return result

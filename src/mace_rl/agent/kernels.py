@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from mace_rl.agent.elementary import exp, log, tanh
-from mace_rl.agent.products import add_product, by_tiles, dot, padded, product
+from mace_rl.agent.products import add_product, address, by_tiles, dot, padded, product
 
 # Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
 kernel = njit(cache=True, error_model="numpy")
@@ -38,33 +38,33 @@ def forward(inputs, parameters, sizes, activations):
 
     inputs: [N, in]; activations: from `room_for` at least N, filled with what every layer puts out.
     """
-    below, below_row = inputs.ctypes.data, inputs.shape[1]
-    weights, end, width = parameters.ctypes.data, 0, 0
+    below, below_row = address(inputs), inputs.shape[1]
+    weights, end, width = address(parameters), 0, 0
     for layer in range(len(sizes) - 1):
         ins, width = sizes[layer], padded(sizes[layer + 1])
         bias = weights + 4 * ins * width
         above = activations[end : end + len(inputs) * width]
         by_tiles(
             *(below, below_row, 1, weights, width, bias, 0),
-            *(above.ctypes.data, width, len(inputs), width, ins),
+            *(address(above), width, len(inputs), width, ins),
         )
         if layer < len(sizes) - 2:
             for k in range(len(above)):
                 above[k] = tanh(above[k])
-        below, below_row, weights = above.ctypes.data, width, bias + 4 * width
+        below, below_row, weights = address(above), width, bias + 4 * width
         end += len(above)
     return activations[end - len(inputs) * width : end].reshape(len(inputs), width)
 
 
 @kernel
 def transposed(parameters, sizes):
-    """The weights of each layer but the first, transposed for `backward`, [out, padded in]."""
+    """The weights of each layer, transposed for `backward`, [out, padded in]."""
     total = 0
-    for layer in range(1, len(sizes) - 1):
+    for layer in range(len(sizes) - 1):
         total += sizes[layer + 1] * padded(sizes[layer])
     result = np.zeros(total, np.float32)
-    start, place = (sizes[0] + 1) * padded(sizes[1]), 0
-    for layer in range(1, len(sizes) - 1):
+    start = place = 0
+    for layer in range(len(sizes) - 1):
         ins, outs = sizes[layer], sizes[layer + 1]
         end = start + (ins + 1) * padded(outs)
         weights = parameters[start:end].reshape(ins + 1, padded(outs))
@@ -78,19 +78,19 @@ def transposed(parameters, sizes):
 
 
 @kernel
-def backward(inputs, activations, grad_outputs, back, sizes, gradient, room):
+def backward(inputs, activations, grad_outputs, back, sizes, gradient, room, grad_inputs):
     """Add to `gradient`, like the parameters, that of a loss.
 
     inputs, activations: of `forward`; grad_outputs: the loss's gradient at the outputs, [N, padded
     out], with zeros in the columns added; back: the weights `transposed`; room: like `activations`,
-    overwritten.
+    overwritten. grad_inputs: [N, padded in], filled in with the loss's gradient there; or [0, 0].
     """
     count, ones = len(inputs), np.ones((1, len(inputs)), np.float32)
     end = place = below_end = 0
     for layer in range(len(sizes) - 1):
         end += (sizes[layer] + 1) * padded(sizes[layer + 1])
+        place += sizes[layer + 1] * padded(sizes[layer])
         if layer > 0:
-            place += sizes[layer + 1] * padded(sizes[layer])
             below_end += count * padded(sizes[layer])
     grad = grad_outputs
     for layer in range(len(sizes) - 2, -1, -1):
@@ -99,15 +99,18 @@ def backward(inputs, activations, grad_outputs, back, sizes, gradient, room):
         change = gradient[start:end].reshape(ins + 1, padded(outs))
         end = start
         add_product(ones, grad, change[ins:])
+        width = padded(ins)
+        weights = back[place - outs * width : place].reshape(outs, width)
+        place -= outs * width
         if layer == 0:
             add_product(inputs.T, grad, change[:ins])
+            if len(grad_inputs) > 0:
+                product(grad, weights, np.zeros(width, np.float32), grad_inputs)
             break
-        below_start, width = below_end - count * padded(ins), padded(ins)
+        below_start = below_end - count * width
         below, flat = activations[below_start:below_end], room[below_start:below_end]
         below_end = below_start
         add_product(below.reshape(count, width).T, grad, change[:ins])
-        weights = back[place - outs * width : place].reshape(outs, width)
-        place -= outs * width
         grad_below = flat.reshape(count, width)
         product(grad, weights, np.zeros(width, np.float32), grad_below)
         for k in range(len(flat)):
@@ -124,16 +127,17 @@ def network_outputs(inputs, parameters, sizes):
 
 
 @kernel
-def network_gradient(inputs, activations, parameters, grad_outputs, sizes):
+def network_gradient(inputs, activations, parameters, grad_outputs, sizes, grad_inputs):
     """Gradient, like the parameters, of a loss.
 
-    activations: of `network_outputs`; grad_outputs: the loss's gradient at the outputs, [N, out].
+    activations: of `network_outputs`; grad_outputs: the loss's gradient at the outputs, [N, out];
+    grad_inputs: see `backward`.
     """
     padded_grad = np.zeros((len(inputs), padded(sizes[-1])), np.float32)
     padded_grad[:, : sizes[-1]] = grad_outputs
     gradient = np.zeros_like(parameters)
     back, room = transposed(parameters, sizes), np.empty_like(activations)
-    backward(inputs, activations, padded_grad, back, sizes, gradient, room)
+    backward(inputs, activations, padded_grad, back, sizes, gradient, room, grad_inputs)
     return gradient
 
 

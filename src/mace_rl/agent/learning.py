@@ -53,7 +53,7 @@ def improve_policy(
     old, gain = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     new, weights = np.empty_like(old), np.empty_like(old)
     activations, room = room_for(BLOCK, sizes), room_for(BLOCK, sizes)
-    gradient = np.empty_like(parameters)
+    gradient, nobody_s = np.empty_like(parameters), np.empty((0, 0), np.float32)
     sums, norm = np.zeros(3), 0.0
     for order in epochs:
         sums[:] = 0
@@ -79,7 +79,7 @@ def improve_policy(
                     *(outputs[:, :outs], log_std, done[:count], weights[:count]),
                     *(share * entropy_coefficient, grad[:, :outs], gradient[log_std_at:], sums),
                 )
-                backward(seen[:count], activations, grad, back, sizes, gradient, room)
+                backward(seen[:count], activations, grad, back, sizes, gradient, room, nobody_s)
             norm = adam.step(gradient, *optimiser)
             first = end
     return norm, sums
@@ -94,7 +94,7 @@ def improve_values(observations, returns, epochs, ends, sizes, optimiser):
     parameters = optimiser[0]
     seen = np.empty((BLOCK, observations.shape[1]), np.float32)
     activations, room = room_for(BLOCK, sizes), room_for(BLOCK, sizes)
-    gradient = np.empty_like(parameters)
+    gradient, nobody_s = np.empty_like(parameters), np.empty((0, 0), np.float32)
     norm = 0.0
     for order in epochs:
         first = 0
@@ -110,7 +110,7 @@ def improve_values(observations, returns, epochs, ends, sizes, optimiser):
                 grad = np.zeros_like(values)
                 for n in range(len(chosen)):
                     grad[n, 0] = value_grad(values[n, 0], returns[chosen[n]], end - first)
-                backward(inputs, activations, grad, back, sizes, gradient, room)
+                backward(inputs, activations, grad, back, sizes, gradient, room, nobody_s)
             norm = adam.step(gradient, *optimiser)
             first = end
     return norm
@@ -120,3 +120,28 @@ def improve_values(observations, returns, epochs, ends, sizes, optimiser):
 def value_grad(value, target, count):
     """Gradient of the mean of `count` squared errors at one of the values."""
     return np.float32(2 / count) * (value - target)
+
+
+@kernel
+def policy_gradients(observations, actions, weights, parameters, sizes, log_std_at):
+    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n].
+
+    parameters: the policy's; the other arguments as in `improve_policy`.
+    """
+    log_std, outs = parameters[log_std_at:], sizes[-1]
+    activations, room = room_for(BLOCK, sizes), room_for(BLOCK, sizes)
+    back, sums = transposed(parameters, sizes), np.zeros(3)
+    gradients = np.zeros((len(weights), len(parameters)), np.float32)
+    nobody_s = np.empty((0, 0), np.float32)
+    for start in range(0, len(observations), BLOCK):
+        end = min(start + BLOCK, len(observations))
+        seen, done = observations[start:end], actions[start:end]
+        outputs = forward(seen, parameters, sizes, activations)
+        grad = np.zeros_like(outputs)
+        for k in range(len(weights)):
+            log_prob_gradient(
+                *(outputs[:, :outs], log_std, done, weights[k, start:end], 0.0),
+                *(grad[:, :outs], gradients[k, log_std_at:], sums),
+            )
+            backward(seen, activations, grad, back, sizes, gradients[k], room, nobody_s)
+    return gradients

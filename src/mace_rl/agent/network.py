@@ -39,6 +39,9 @@ class Network(Protocol):
         trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
         """
 
+    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same, and the gradient with respect to the inputs, [N, in]."""
+
     def move_to(self, memory: np.ndarray) -> None:
         """Keep the parameters in `memory`, float32 [n], from now on."""
 
@@ -59,19 +62,28 @@ class TorchNetwork:
 
     def forward(self, inputs: np.ndarray) -> Trace:
         """See `Network`."""
-        outputs = self._module(torch.from_numpy(np.ascontiguousarray(inputs, np.float32)))
-        return Trace(outputs.detach().numpy(), outputs)
+        seen = torch.from_numpy(np.array(inputs, np.float32)).requires_grad_()
+        outputs = self._module(seen)
+        return Trace(outputs.detach().numpy(), (outputs, seen))
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
         """See `Network`."""
+        outputs, _ = trace.saved
         gradients = torch.autograd.grad(
-            trace.saved,
+            outputs,
             list(self._module.parameters()),
             torch.from_numpy(grad_outputs),
             retain_graph=True,
             materialize_grads=True,
         )
         return torch.cat([gradient.ravel() for gradient in gradients]).numpy()
+
+    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Network`."""
+        outputs, seen = trace.saved
+        weights = torch.from_numpy(grad_outputs)
+        inward = torch.autograd.grad([outputs], [seen], [weights], retain_graph=True)
+        return self.backward(trace, grad_outputs), inward[0].numpy()
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`."""
@@ -110,10 +122,21 @@ class CompiledMLP:
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
         """See `Network`."""
-        return kernels.network_gradient(*trace.saved, self.parameters, grad_outputs, self.sizes)
+        nobody_s = np.empty((0, 0), np.float32)
+        given = *trace.saved, self.parameters, grad_outputs, self.sizes
+        return kernels.network_gradient(*given, nobody_s)
+
+    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Network`."""
+        inputs = self.sizes[0]
+        inward = np.empty((len(grad_outputs), padded(inputs)), np.float32)
+        given = *trace.saved, self.parameters, grad_outputs, self.sizes
+        return kernels.network_gradient(*given, inward), inward[:, :inputs]
 
     def move_to(self, memory: np.ndarray) -> None:
-        """See `Network`."""
+        """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""
+        if memory.dtype != np.float32 or not memory.flags.c_contiguous:
+            raise ValueError(f"parameters have to be contiguous float32, not {memory.dtype}")
         memory[:] = self.parameters
         self.parameters = memory
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mace_rl.agent.kernels import kernel, normalise
+from mace_rl.agent.kernels import kernel
 
 
 class RunningNormaliser:
@@ -81,6 +81,9 @@ def standardised(observations, mean, std, bound):
     """`normalise` of each row, float32 [N, size], as acting does it with the same mean and std."""
     result = np.empty(observations.shape, np.float32)
     centre, inverse = mean.astype(np.float32), (1 / std).astype(np.float32)
-    for n in range(len(observations)):
-        normalise(observations[n], centre, inverse, np.float32(bound), result[n])
+    clip = np.float32(bound)
+    for n in range(len(observations)):  # written out: a call for each row takes ten times as long
+        for i in range(len(centre)):
+            value = (observations[n, i] - centre[i]) * inverse[i]
+            result[n, i] = min(max(value, -clip), clip)
     return result

@@ -11,7 +11,7 @@ import torch
 from mace_rl.agent import kernels
 from mace_rl.agent.adam import Adam
 from mace_rl.agent.advantages import generalised_advantages
-from mace_rl.agent.learning import improve_policy, improve_values
+from mace_rl.agent.learning import improve_policy, improve_values, policy_gradients
 from mace_rl.agent.network import CompiledMLP, Network
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import ActingPolicy, Policy
@@ -278,11 +278,20 @@ class PPO:
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
         """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
+        network = self.policy.network
+        weights = np.empty((len(advantages), len(actions)), np.float32)
+        for row, item in zip(weights, advantages, strict=True):
+            row[:] = item / len(item)
+        if isinstance(network, CompiledMLP):
+            observations = np.ascontiguousarray(observations, np.float32)
+            return list(
+                policy_gradients(
+                    *(observations, actions, weights, self.policy.parameters),
+                    *(network.sizes, len(network.parameters)),
+                )
+            )
         trace = self.policy.forward(observations)
-        return [
-            self.policy.gradient(trace, actions, (item / len(item)).astype(np.float32))
-            for item in advantages
-        ]
+        return [self.policy.gradient(trace, actions, row) for row in weights]
 
     def minibatches_of(self, batch: Batch) -> Minibatches:
         """The minibatches of an update; the whole batch in order if it is one."""

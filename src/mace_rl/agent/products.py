@@ -37,12 +37,12 @@ def fused(module: ir.Module) -> ir.Function:
     )
 
 
-def everywhere(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    """A vector of one float."""
-    undefined = ir.Constant(VECTOR, ir.Undefined)
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+def everywhere(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> ir.Value:
+    """A vector of one number."""
+    undefined = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, undefined, lanes)
+    places = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+    return builder.shuffle_vector(first, undefined, places)
 
 
 def tile(rows: int, vectors: int) -> Any:
@@ -111,6 +111,12 @@ SLIM_ROWS = 8 if WIDE else 6
 
 
 @njit(cache=True)
+def address(array):
+    """Where its elements begin, as int64: compiled code then has one kind of addresses."""
+    return np.int64(array.ctypes.data)
+
+
+@njit(cache=True)
 def by_tiles(a, a_row, a_k, b, b_row, start, start_row, c, c_row, rows, columns, count):
     """C = start + A · B for `rows` × `columns` elements and K = `count`; arguments as in `tile`."""
     a_row, a_k, b_row, start_row, c_row = 4 * a_row, 4 * a_k, 4 * b_row, 4 * start_row, 4 * c_row
@@ -164,8 +170,8 @@ def product(a, b, start, c):
     contiguous and n a multiple of 16; all float32.
     """
     by_tiles(
-        *(a.ctypes.data, a.strides[0] // 4, a.strides[1] // 4, b.ctypes.data, b.shape[1]),
-        *(start.ctypes.data, 0, c.ctypes.data, c.shape[1], len(c), c.shape[1], len(b)),
+        *(address(a), a.strides[0] // 4, a.strides[1] // 4, address(b), b.shape[1]),
+        *(address(start), 0, address(c), c.shape[1], len(c), c.shape[1], len(b)),
     )
 
 
@@ -173,8 +179,8 @@ def product(a, b, start, c):
 def add_product(a, b, c):
     """C = C + A · B: every chain goes on from what C has; arguments as in `product`."""
     by_tiles(
-        *(a.ctypes.data, a.strides[0] // 4, a.strides[1] // 4, b.ctypes.data, b.shape[1]),
-        *(c.ctypes.data, c.shape[1], c.ctypes.data, c.shape[1], len(c), c.shape[1], len(b)),
+        *(address(a), a.strides[0] // 4, a.strides[1] // 4, address(b), b.shape[1]),
+        *(address(c), c.shape[1], address(c), c.shape[1], len(c), c.shape[1], len(b)),
     )
 
 

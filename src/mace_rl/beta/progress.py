@@ -53,7 +53,7 @@ class Progress:
             log(np.float32(1 + self.stalled)) / 2,
             logit(min(max(beta, 1e-6), 1 - 1e-6)) / 2,
         )
-        return np.clip(features, -3, 3)
+        return np.array([min(max(float(feature), -3.0), 3.0) for feature in features])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load_state_dict` needs."""

@@ -56,6 +56,11 @@ class CompiledAutoencoder(CompiledMLP):
         """See `Network`."""
         return super().backward(trace, grad_outputs) * self.mask
 
+    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Network`."""
+        gradient, inward = super().gradients(trace, grad_outputs)
+        return gradient * self.mask, inward
+
 
 class DensityEstimator:
     """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)).

@@ -1,66 +1,29 @@
 """The intrinsic curiosity module, ICM (Pathak et al. 2017)."""
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
-from torch.nn.functional import log_softmax
 
-from mace_rl.agent.network import TorchNetwork, mlp
+from mace_rl.agent.kernels import log_prob_gradient
+from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, mlp
+from mace_rl.agent.products import dot
 from mace_rl.bonus.intrinsic import PredictionError
 from mace_rl.config.bonus import ICMBonus
 from mace_rl.environments.rollout import Episode
 
 
-class Dynamics(torch.nn.Module):
-    """Features φ of states, and the two models that learn them, each with one hidden layer.
-
-    The inverse model says from φ(s) and φ(s') which action led from one to the other, so that φ
-    need not hold what no action can influence; the forward model says from φ(s) and the action what
-    φ(s') is.
-    """
-
-    def __init__(
-        self,
-        config: ICMBonus,
-        action_space: Box | Discrete,
-        observation_size: int,
-        generator: np.random.Generator,
-    ) -> None:
-        super().__init__()
-        hidden, features = config.hidden_units, config.feature_units
-        self.discrete_actions = isinstance(action_space, Discrete)
-        actions = (
-            int(action_space.n) if isinstance(action_space, Discrete) else action_space.shape[0]
-        )
-        self.parts = [observation_size, observation_size, actions]
-        self.features = mlp([observation_size, hidden, features], 1.0, generator)
-        self.inverse_model = mlp([2 * features, hidden, actions], 1.0, generator)
-        self.forward_model = mlp([features + actions, hidden, features], 1.0, generator)
-
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """L_I and L_F (equations 3 and 5) of each transition, [N, 2].
-
-        inputs: s, s' and the action, [N, 2 · observation + actions]; Discrete actions are one-hot.
-        L_I is the cross-entropy of the action, or half the squared error of an action that is a
-        vector.
-        """
-        state, next_state, action = inputs.split(self.parts, dim=1)
-        before, after = self.features(state), self.features(next_state)
-        found = self.inverse_model(torch.cat([before, after], dim=1))
-        if self.discrete_actions:
-            inverse = -(action * log_softmax(found, dim=1)).sum(dim=1)
-        else:
-            inverse = 0.5 * (found - action).square().sum(dim=1)
-        predicted = self.forward_model(torch.cat([before, action], dim=1))
-        return torch.stack([inverse, 0.5 * (predicted - after).square().sum(dim=1)], dim=1)
-
-
 class IntrinsicCuriosityModule(PredictionError):
     """How badly the forward model predicts the features of the next state: η L_F (equation 6).
 
-    All parts are trained together on (1 - `forward_weight`) L_I + `forward_weight` L_F (equation 7,
-    without the policy's term, which is PPO's here). It is a torch module with either engine, since
-    the features' gradient comes through both models.
+    Features φ of states come from a network, and two others learn them, each with one hidden layer:
+
+    - the inverse model says from φ(s) and φ(s') which action led from one to the other, so that φ
+      need not hold what no action can influence. L_I (equation 3) is the negative log-probability
+      of the action: softmax for Discrete ones, Gaussian with standard deviation 1 for vectors;
+    - the forward model says from φ(s) and the action what φ(s') is. L_F (equation 5) is half the
+      squared error.
+
+    All are trained together on (1 - `forward_weight`) L_I + `forward_weight` L_F (equation 7,
+    without the policy's term, which is PPO's here).
     """
 
     config: ICMBonus
@@ -68,15 +31,33 @@ class IntrinsicCuriosityModule(PredictionError):
     def __init__(
         self,
         config: ICMBonus,
+        engine: str,
         observation_space: Box | Discrete,
         action_space: Box | Discrete,
         observation_size: int,
         generator: np.random.Generator,
     ) -> None:
-        network = TorchNetwork(Dynamics(config, action_space, observation_size, generator))
-        super().__init__(config, network, observation_space, observation_size, generator)
+        def new(inputs: int, outputs: int) -> Network:
+            module = mlp([inputs, config.hidden_units, outputs], 1.0, generator)
+            return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
+
+        if isinstance(action_space, Discrete):
+            actions, stds = int(action_space.n), 0
+        else:
+            actions = stds = action_space.shape[0]
+        features = config.feature_units
+        self.features = new(observation_size, features)
+        self.inverse_model = new(2 * features, actions)
+        self.forward_model = new(features + actions, features)
+        networks = self.features, self.inverse_model, self.forward_model
+        ends = np.cumsum([len(network.parameters) for network in networks])
+        parameters = np.empty(ends[-1], np.float32)
+        for network, memory in zip(networks, np.split(parameters, ends[:-1]), strict=True):
+            network.move_to(memory)
+        super().__init__(config, parameters, observation_space, observation_size, generator)
         self.action_space = action_space
-        self.weights = np.array([1 - config.forward_weight, config.forward_weight], np.float32)
+        self.log_std = np.zeros(stds, np.float32)  # of the inverse model
+        self.ends = np.cumsum([observation_size, observation_size])  # of s and s' in `inputs`
 
     def inputs(self, episode: Episode) -> np.ndarray:
         """s and s', whitened, and the action as the environment took it, side by side."""
@@ -90,10 +71,32 @@ class IntrinsicCuriosityModule(PredictionError):
 
     def errors(self, inputs: np.ndarray) -> np.ndarray:
         """See `PredictionError`."""
-        return self.config.scale * self.network.forward(inputs).outputs[:, 1]
+        state, next_state, action = np.split(inputs, self.ends, axis=1)
+        before = self.features.forward(state).outputs
+        predicted = self.forward_model.forward(np.hstack([before, action])).outputs
+        difference = predicted - self.features.forward(next_state).outputs
+        return self.config.scale * np.array([0.5 * dot(row, row) for row in difference])
 
     def gradient(self, inputs: np.ndarray) -> np.ndarray:
-        """Of the mean of the joint loss."""
-        trace = self.network.forward(inputs)
-        count = np.float32(len(inputs))
-        return self.network.backward(trace, np.tile(self.weights / count, (len(inputs), 1)))
+        """Of the mean of the joint loss, which reaches the features through both models."""
+        count, weight = len(inputs), self.config.forward_weight
+        state, next_state, action = np.split(inputs, self.ends, axis=1)
+        features = self.features.forward(np.concatenate([state, next_state]))
+        before, after = features.outputs[:count], features.outputs[count:]
+        inverse = self.inverse_model.forward(np.hstack([before, after]))
+        forward = self.forward_model.forward(np.hstack([before, action]))
+
+        grad_action = np.empty_like(inverse.outputs)
+        log_prob_gradient(
+            *(inverse.outputs, self.log_std, action if len(self.log_std) else action.argmax(1)),
+            *(np.full(count, (weight - 1) / count, np.float32), 0.0),
+            *(grad_action, np.zeros_like(self.log_std), np.zeros(3)),
+        )
+        grad_predicted = np.float32(weight / count) * (forward.outputs - after)
+        inverse_gradient, to_both = self.inverse_model.gradients(inverse, grad_action)
+        forward_gradient, to_before = self.forward_model.gradients(forward, grad_predicted)
+        size = before.shape[1]
+        grad_before = to_both[:, :size] + to_before[:, :size]
+        grad_after = to_both[:, size:] - grad_predicted
+        gradient = self.features.backward(features, np.concatenate([grad_before, grad_after]))
+        return np.concatenate([gradient, inverse_gradient, forward_gradient])

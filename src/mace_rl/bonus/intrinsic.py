@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from mace_rl.agent.adam import Adam
-from mace_rl.agent.network import Network
 from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.config.bonus import ICMBonus, RNDBonus
 from mace_rl.environments.rollout import Episode
@@ -57,10 +56,10 @@ class IntrinsicReward(ABC):
 
 
 class PredictionError(IntrinsicReward):
-    """The error of a network that learns to predict what is visited: high where little was learnt.
+    """The error of networks that learn to predict what is visited: high where little was learnt.
 
-    It learns from each episode once, when that is over, in minibatches of `batch_size` steps in
-    random order. It sees observations whitened by their running mean and standard deviation and
+    They learn from each episode once, when that is over, in minibatches of `batch_size` steps in
+    random order. They see observations whitened by their running mean and standard deviation and
     clipped to ±`CLIP`; of the first episode, before which there are none, as they are. Discrete
     ones are one-hot and stay as they are.
     """
@@ -68,21 +67,20 @@ class PredictionError(IntrinsicReward):
     def __init__(
         self,
         config: ICMBonus | RNDBonus,
-        network: Network,
+        parameters: np.ndarray,
         observation_space: Box | Discrete,
         observation_size: int,
         generator: np.random.Generator,
     ) -> None:
         self.config = config
-        self.network = network
-        self.optimiser = Adam(network.parameters, config.learning_rate)
+        self.optimiser = Adam(parameters, config.learning_rate)
         self.normaliser = RunningNormaliser(observation_size)
         self.discrete = isinstance(observation_space, Discrete)
         self.generator = generator
 
     @abstractmethod
     def inputs(self, episode: Episode) -> np.ndarray:
-        """What the network gets for each step, float32 [T, inputs]."""
+        """What the networks get for each step, float32 [T, inputs]."""
 
     @abstractmethod
     def errors(self, inputs: np.ndarray) -> np.ndarray:
@@ -90,10 +88,10 @@ class PredictionError(IntrinsicReward):
 
     @abstractmethod
     def gradient(self, inputs: np.ndarray) -> np.ndarray:
-        """Gradient, float32 [n], of the loss of N inputs at the network's parameters."""
+        """Gradient, float32 [n], of the loss of N inputs at the parameters."""
 
     def whiten(self, observations: np.ndarray) -> np.ndarray:
-        """Observations as the network sees them, float32 [N, observation]."""
+        """Observations as the networks see them, float32 [N, observation]."""
         return self.normaliser(observations, CLIP)
 
     def bonus(self, episode: Episode) -> Bonus:

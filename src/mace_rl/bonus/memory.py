@@ -50,7 +50,9 @@ class EpisodicMemory:
         kept = min(len(keys), self.config.capacity)
         # A lookup of a long episode reads nearly every entry: of equally used ones the earliest
         # written goes, or entries that are read for ever would never be outdated.
-        oldest = np.argsort(self.usage * 2**32 + self.number)[:kept]
+        age = self.usage * 2**32 + self.number
+        oldest = np.argpartition(age, kept - 1)[:kept]
+        oldest = oldest[np.argsort(age[oldest])]
         self.keys[oldest] = keys[-kept:]
         self.values[oldest] = np.column_stack([next_states, rewards, returns])[-kept:]
         self.usage[oldest] = self.time
@@ -64,7 +66,8 @@ class EpisodicMemory:
         # Of equally near entries the first is read: the last written, so that what came of a state
         # lately is what is remembered of it.
         self.newest_first = np.argsort(-self.number[: len(self)])
-        self.neighbours = Neighbours(self.keys[self.newest_first], mean, std)
+        newest = np.take(self.keys, self.newest_first, axis=0)
+        self.neighbours = Neighbours(newest, mean, std)
 
     def search(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The k nearest entries to each state, float32 [N, key], which have been read now.

@@ -197,7 +197,11 @@ class DensityNovelty(Novelty):
             self.refresh()
 
     def refresh(self) -> None:
-        """Write what waits, train the density estimator, and see what is usual now."""
+        """Write what waits, train the density estimator, and see what is usual now.
+
+        What waits is new or not by what was usual until now: what is usual depends on the buffer
+        with it.
+        """
         free = self.waiting[: len(self.buffer) - self.seen]
         self.buffer[self.seen : self.seen + len(free)] = free
         self.seen += len(free)
@@ -217,8 +221,9 @@ class DensityNovelty(Novelty):
         self.usual_log_density = quantile(log_probs.astype(np.float64), 1 - KNOWN)
         known = samples[-1][: self.config.calibration_states]
         squared_distances, _ = self.neighbours.nearest(known, self.largest + 1)
-        distances = mean_distances(squared_distances[:, 1:], self.ensemble)  # the nearest is itself
-        self.usual_distances = np.array([quantile(column, KNOWN) for column in distances.T])
+        others = np.ascontiguousarray(squared_distances[:, 1:])  # the nearest is itself
+        distances = np.ascontiguousarray(mean_distances(others, self.ensemble).T)
+        self.usual_distances = np.array([quantile(column, KNOWN) for column in distances])
 
     def _replace_redundant(self, states: np.ndarray) -> bool:
         """Let states that are far from the buffer take the places of entries close to others.

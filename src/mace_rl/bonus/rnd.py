@@ -37,8 +37,9 @@ class RandomNetworkDistillation(PredictionError):
             module = mlp(sizes, math.sqrt(2), generator)
             return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
 
-        self.target = new()
-        super().__init__(config, new(), observation_space, observation_size, generator)
+        self.target, self.network = new(), new()
+        parameters = self.network.parameters
+        super().__init__(config, parameters, observation_space, observation_size, generator)
 
     def inputs(self, episode: Episode) -> np.ndarray:
         """The states that the steps led to, whitened."""
