@@ -37,7 +37,7 @@ from mace_rl.experience import (
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
 from mace_rl.finite import NonFiniteError, require_finite, require_share
-from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows
+from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
 
 
@@ -129,8 +129,8 @@ class Trainer:
                 env_steps=before + len(episode),
                 length=len(episode),
                 extrinsic_return=total(episode.rewards),
-                intrinsic_return=total(reward),
-                beta=beta,
+                intrinsic_return=rounded(total(reward)),
+                beta=rounded(beta),
                 terminated=int(episode.terminated),
             )
         )

@@ -30,8 +30,8 @@ class EpisodeRecord:
     env_steps: int  # environment steps since the start of training, this episode included
     length: int  # environment steps of this episode
     extrinsic_return: float  # undiscounted sum of the environment's rewards
-    intrinsic_return: float  # undiscounted sum of the curiosity bonus, not weighted by β
-    beta: float  # β of this episode
+    intrinsic_return: float  # undiscounted sum of the curiosity bonus, not weighted by β; `rounded`
+    beta: float  # β of this episode; `rounded`
     terminated: int  # 1: the environment ended the episode, 0: its time limit did
 
 
@@ -61,6 +61,11 @@ class UpdateRecord:
 RunKey = tuple[str, str, int]  # environment, variant, seed
 
 Row = TypeVar("Row", EpisodeRecord, UpdateRecord)
+
+
+def rounded(value: float) -> float:
+    """To six significant digits: enough for every result, and half the size of a kept study."""
+    return float(f"{value:.6g}")
 
 
 def as_columns(kind: type[Row], rows: Sequence[Row]) -> dict[str, np.ndarray]:
