@@ -1,0 +1,86 @@
+"""The protocol's page against the code that judges, and against the runs that it came before."""
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mace_rl import files
+from mace_rl.config.study import read_study
+from mace_rl.results.claims import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
+from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, QUESTIONS, ROBUST
+from tools import kept_runs
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "protocol.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+ROWS = {
+    cells[0]: cells[1:]
+    for line in reversed(TEXT.splitlines())  # the power of some comes later
+    if re.match(r"\| (C|Q)\d", line) and len(cells := line.strip("| ").split(" | ")) > 2
+}
+
+
+def metrics(cell: str, column: int) -> set[str]:
+    """What a cell of the claims' table names, or the cell that it refers to."""
+    if referred := re.fullmatch("as (C[0-9]+)", cell):
+        return metrics(ROWS[referred[1]][column], column)
+    return set(re.findall("`([a-z_]+)`", cell)) or {CORRELATION}
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
+def test_claims_are_measured_as_the_page_says(claim) -> None:
+    named = metrics(ROWS[claim.name][1], 1) - {CORRELATION}  # C6: of one part
+    for how, column in ((ROBUST, 2), (LITERAL, 3)):
+        expected = {part.metric for part in claim.parts[how]}
+        assert metrics(ROWS[claim.name][column], column) | named == expected
+
+
+def test_questions_have_the_parts_that_the_page_has() -> None:
+    count = {claim.name: len(claim.parts[ROBUST]) for claim in QUESTIONS}
+    # By its words: five tasks; three; three times five others; four; one and one.
+    assert count == dict(
+        zip(["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", "Q7", "Q8"], [5, 3, 5, 5, 5, 4, 1, 1], strict=True)
+    )
+    assert {name for names in ROWS for name in names.split(", ")} >= {
+        claim.name for family in FAMILIES for claim in family.claims if claim.name[0] == "C"
+    }
+    assert f"{WORTH_MENTIONING:.0%}".replace("%", " %") in TEXT
+    assert f"below {LEVEL}" in TEXT and f"fewer than {FEWEST_SEEDS} seeds" in TEXT
+
+
+def test_configurations_have_the_runs_that_the_page_has() -> None:
+    runs = {}
+    for name in ("study", "questions"):
+        study = read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"])
+        for env, variant, seed in study.runs():
+            runs.setdefault(name, {}).setdefault((env, variant), []).append(seed)
+    assert all(seeds == list(range(100, 120)) for seeds in runs["study"].values())
+    assert len(runs["study"]) == 9 and len(runs["questions"]) == 80
+    for (env, _), seeds in runs["questions"].items():
+        last = 159 if env.startswith(("Barren", "Noisy")) else 119
+        assert seeds == list(range(100, last + 1))
+
+
+@pytest.mark.slow
+def test_every_run_came_after_the_page_and_from_one_state_of_the_code() -> None:
+    git = ["git", "-C", str(ROOT)]
+    if subprocess.run([*git, "rev-parse", "--is-shallow-repository"], capture_output=True,
+                      text=True, check=False).stdout.strip() != "false":  # fmt: skip
+        pytest.skip("not a git repository with its whole history")
+    records = [
+        json.loads(content)
+        for archive in sorted((ROOT / "reference" / "study").glob("*/*.tar.xz"))
+        for name, content in kept_runs.read(archive).items()
+        if name.endswith(files.RECORD)
+    ]
+    records = [record for record in records if record["config"]["seed"] in range(100, 200)]
+    if not records:
+        pytest.skip("no run of the confirmation is kept yet")
+    ((commit, dirty),) = {tuple(record["code"].values()) for record in records}
+    assert not dirty and len({record["sources"] for record in records}) == 1
+    log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(PAGE)], capture_output=True,
+                         text=True, check=True)  # fmt: skip
+    subprocess.run([*git, "merge-base", "--is-ancestor", log.stdout.strip(), commit], check=True)
