@@ -109,6 +109,19 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
         assert [part[t] for part in found] == pytest.approx(expected, rel=1e-3)
 
 
+def test_states_are_compared_in_units_of_all_that_were_remembered(make):
+    """Discrete ones are one-hot and stay as they are."""
+    curiosity, played = make(), [wander(seed, centre=5.0, scale=2.0) for seed in range(3)]
+    for episode in played:
+        curiosity.remember(episode, np.zeros(30))
+    states = np.concatenate([episode.observations[1:] for episode in played]).astype(np.float64)
+    np.testing.assert_allclose(curiosity.normaliser.mean, states.mean(axis=0))
+    np.testing.assert_allclose(curiosity.normaliser.std, states.std(axis=0))
+    discrete = make("FrozenLake-v1")
+    discrete.remember(episode_of(np.eye(16)[[0, 4, 8, 9]]), np.zeros(3))
+    assert discrete.normaliser.count == 0
+
+
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
 def test_one_state_or_many(make, name):
     """In [0, 1]; asked for one after the other, an episode gets what it gets at once, and again.

@@ -160,3 +160,14 @@ def test_importing_results_modules_is_quick():
         command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
         run = subprocess.run(command, capture_output=True, text=True, check=True)
         assert run.stdout.split() == []
+
+
+def test_an_inset_shows_a_beginning_in_which_most_is_learned():
+    runs = frames(episodes=200)
+    for (environment, variant, seed), run in runs.items():
+        slope = 0.5 if (environment, variant) == ("B-v1", "ppo") else 20  # of both one learns late
+        run["extrinsic_return"] = np.minimum(slope * np.arange(200), 100.0) + seed
+    first, second = draw(runs=runs, inset=0.1).axes[:2]
+    [inset] = first.child_axes
+    assert inset.get_xlim() == (0, 20) and not second.child_axes
+    assert [line.get_xdata().tolist() for line in inset.lines] == [list(range(1, 21))] * 2

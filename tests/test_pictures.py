@@ -9,7 +9,7 @@ import pytest
 from invented import SEEDS, table_for_claims, table_for_questions, table_for_scores
 from matplotlib.figure import Figure
 
-from mace_rl.config.results import MetricsConfig, RegretConfig
+from mace_rl.config.results import FigureConfig, MetricsConfig, RegretConfig
 from mace_rl.config.study import Study, read_study
 from mace_rl.report.panels import svg
 from mace_rl.results.claims import ledger
@@ -59,7 +59,13 @@ def test_every_run_is_there_with_its_returns(runs, settings) -> None:
 
 def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings) -> None:
     table = PICTURES["constants"].data(runs, settings)
-    for environment, rows in table.groupby("env"):
+    names = sorted(set(table["variant"]))
+    look = Look(
+        FigureConfig(columns=3), 0.95, {name: name for name in names}, dict.fromkeys(names, "C0")
+    )
+    panels = PICTURES["constants"].draw(table, look).axes
+    for (environment, rows), axes in zip(table.groupby("env", sort=False), panels, strict=False):
+        assert len(axes.containers) == (rows["role"] != "learned").sum()  # dots with bars
         assert dict(zip(rows["variant"], rows["role"], strict=True)) == {
             **dict.fromkeys(CONSTANTS, "constant"),
             "mace_full": "learned",
