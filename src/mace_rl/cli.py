@@ -106,6 +106,13 @@ def parser() -> argparse.ArgumentParser:
     add("folder", type=Path, help="of a run, or with runs below it")
     add("--out", type=Path, help="folder for the event files (default: beside the records)")
     add = command(
+        "export",
+        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ...",
+        "results/runs --out runs.csv",
+    )
+    add("folder", type=Path, help="of a run, or with runs below it")
+    add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")
+    add = command(
         "verify",
         "repeat kept runs and compare to the bit",
         "reference --sample 1",
@@ -215,6 +222,17 @@ def tensorboard(arguments: argparse.Namespace) -> None:
     logger.info("runs: %d; look at them with: tensorboard --logdir %s", count, out)
 
 
+def export(arguments: argparse.Namespace) -> None:
+    """`mace-rl export`."""
+    out: Path = arguments.out
+    _require(out.suffix in (".csv", ".parquet"), "--out", str(out), "end in .csv or .parquet")
+    from mace_rl.runs import export
+
+    table = export.columns(arguments.folder)
+    export.write(table, out)
+    logger.info("%d episodes: %s", len(table["task"]), out)
+
+
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
     sample = arguments.sample
@@ -234,6 +252,7 @@ def main() -> None:
         "evaluate": evaluate,
         "watch": watch,
         "tensorboard": tensorboard,
+        "export": export,
         "verify": verify,
     }
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -241,6 +260,13 @@ def main() -> None:
         commands[arguments.command](arguments)
     except (Refusal, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
+    except ModuleNotFoundError as error:
+        if (
+            arguments.command == "train"
+        ):  # in code of the user's own, whose place the traceback tells
+            raise
+        extra = "tensorboard" if arguments.command == "tensorboard" else "study"
+        sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
     except KeyboardInterrupt:
         resumes = arguments.command == "train"
         logger.info("interrupted%s", "; the same command resumes it" if resumes else "")

@@ -264,7 +264,7 @@ def _check_environment(config: RunConfig) -> None:
         if "Bullet" in own and importlib.util.find_spec("pybullet_envs_gymnasium") is None:
             raise ConfigError(
                 f"{key} has {name!r}, but the package it needs should be installed: "
-                "pip install 'mace-rl[study]'"
+                "mace-rl's extra [study] has it"
             )
         _check_known(own, registered(), key, "Gymnasium's registry")
     spec = registered()[own]

@@ -9,6 +9,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Dict, Tuple
+from gymnasium.wrappers import FlattenObservation
 
 from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError
@@ -78,6 +80,8 @@ class Environment(Spaces):
                 raise ConfigError(
                     f"environment {name!r} needs a package that should be installed: {reason}"
                 ) from None
+        if isinstance(self.env.observation_space, Tuple | Dict):
+            self.env = FlattenObservation(self.env)
         super().__init__(name, self.env.observation_space, self.env.action_space)
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
