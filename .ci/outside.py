@@ -5,11 +5,13 @@ its pages, whose examples are carried out.
 """
 
 import importlib.util
+import io
 import json
 import re
 import shlex
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from importlib.metadata import version
 from pathlib import Path
 
@@ -58,7 +60,8 @@ def main() -> None:
     for page in ("README.md", "docs/wrappers.md"):
         names: dict[str, object] = {}
         for block in blocks(project / page, "python"):
-            exec(block, names)
+            with redirect_stdout(io.StringIO()):
+                exec(block, names)
     extending = project / "docs" / "extending.md"
     for block in blocks(extending, "python") + blocks(extending, "yaml"):
         name = block.splitlines()[0].removeprefix("# ")
