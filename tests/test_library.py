@@ -16,6 +16,7 @@ from shared import call
 
 import mace_rl
 from mace_rl import load_agent, settings, train
+from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.results.records import read_episodes
 
@@ -58,6 +59,11 @@ def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     beta = {"kind": "constant", "value": 0.1}
     assert found.settings() == expected | {"variant": "low", "beta": beta}
     assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
+
+
+def test_the_package_s_defaults_are_config_yaml_itself():
+    """Not a copy: what one edits there is what a run by hand gets."""
+    assert DEFAULTS == ROOT / "config.yaml"
 
 
 MISTAKES = {
