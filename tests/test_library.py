@@ -43,6 +43,17 @@ def test_importing_loads_little_and_changes_nothing():
     assert not {"numpy", "torch", "numba", "gymnasium"} & {*bare}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.pins"])
+def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
+    """As those say themselves, which read it when they are imported."""
+    numpy_has, torch_has = told(
+        f"import {module}, json, torch; from numpy._core._multiarray_umath import __cpu_features__;"
+        "print(json.dumps([__cpu_features__, torch.backends.cpu.get_cpu_capability()]))"
+    )
+    assert numpy_has["AVX2"] and not numpy_has["AVX512_SKX"] and torch_has == "AVX2"
+
+
 def test_each_name_is_what_its_module_has_and_no_other_is_there():
     assert mace_rl.train.__module__ == mace_rl.settings.__module__ == "mace_rl.library"
     assert mace_rl.CuriosityReward.__module__ == "mace_rl.wrappers"

@@ -108,7 +108,7 @@ def parser() -> argparse.ArgumentParser:
     add = command(
         "export",
         "write the episodes of finished runs as one table: task, algorithm, seed, step, return ...",
-        "results/runs --out runs.csv",
+        "cartpole_run --out runs.csv",
     )
     add("folder", type=Path, help="of a run, or with runs below it")
     add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")

@@ -266,7 +266,8 @@ def _check_environment(config: RunConfig) -> None:
                 f"{key} has {name!r}, but the package it needs should be installed: "
                 "mace-rl's extra [study] has it"
             )
-        _check_known(own, registered(), key, "Gymnasium's registry")
+        hint = "" if ":" in name else f" (if a module registers it: module:{name})"
+        _check_known(own, registered(), key, f"Gymnasium's registry{hint}")
     spec = registered()[own]
     if (config.max_episode_steps or spec.max_episode_steps) is None:
         raise ConfigError(
