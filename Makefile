@@ -27,7 +27,7 @@ PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxp
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick tables report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick test-wheel tables report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -40,6 +40,9 @@ test: setup ## every test but those of cross-cpu, kill-test and slurm-test, on u
 
 test-quick: setup ## the tests that take seconds, for the edit loop
 	@$(PYTEST) -m "not slow" # which those are, too
+
+test-wheel: setup ## the wheel in environments of its own: newest, lowest, Debian 13 (minutes)
+	@.ci/wheel
 
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
@@ -73,6 +76,7 @@ lint: setup ## check style, types and workflow
 	$(IN_VENV) mypy
 	$(IN_VENV) snakefmt --check Snakefile workflow
 	$(IN_VENV) tools.lint_workflow
+	.venv/bin/actionlint
 
 # --- the environment ------------------------------------------------------------------------------
 
@@ -141,8 +145,8 @@ lock: ## write environment.lock anew from pyproject.toml (UPGRADE=1: take newer 
 	@$(call throwaway,uv==0.13.8)
 	cat environment.lock environment-cuda.lock >"$$folder/lock"
 	unset $${!UV_@} # the machine's settings must not show in the lock
-	"$$folder/bin/python" -m uv pip compile pyproject.toml --all-extras --python-version=3.11 \
-	    --python-platform=linux --generate-hashes --no-header --no-emit-index-url \
+	"$$folder/bin/python" -m uv pip compile pyproject.toml --python-version=3.11 \
+	    $(addprefix --extra=,study slurm tensorboard dev) --python-platform=linux --generate-hashes --no-header --no-emit-index-url \
 	    --no-emit-find-links --no-config --quiet $(if $(UPGRADE),--upgrade) -o "$$folder/lock"
 	grep -q $(TORCH_CPU_HASH) "$$folder/lock" ||
 	    sed -i 's/^$(TORCH) .*/&\n    --hash=$(TORCH_CPU_HASH) \\/' "$$folder/lock"

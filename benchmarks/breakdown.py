@@ -37,7 +37,7 @@ BONUS = {
 ALL_SECTIONS = list(SECTIONS | BONUS)
 # Functions of modules: section, module, name.
 FUNCTIONS = (
-    ("acting", "mace_rl.train", "draw_noise"),
+    ("acting", "mace_rl.trainer", "draw_noise"),
     ("acting", "mace_rl.agent.kernels", "act_box"),
     ("memory", "mace_rl.bonus.curiosity", "relevance"),
 )
@@ -95,7 +95,7 @@ def profile(
     contestant: str, environment: str, seed: int, steps: int
 ) -> tuple[int, dict[str, float]]:
     """How many steps were done, at least `steps` from scratch, and seconds by part."""
-    from mace_rl.train import Trainer
+    from mace_rl.trainer import Trainer
 
     warm_up(contestant, environment, seed)
     trainer = Trainer(our_config(contestant, environment, seed))

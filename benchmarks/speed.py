@@ -112,7 +112,7 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
             full_batch = {"n_steps": 2048, "batch_size": 2048, "n_epochs": 4}
             return stable_baselines3(environment, seed, steps, **full_batch)
         case _:
-            from mace_rl.train import Trainer
+            from mace_rl.trainer import Trainer
 
             trainer = Trainer(our_config(contestant, environment, seed))
             return (records[-1].env_steps for records in trainer.run())

@@ -7,7 +7,7 @@ their means over the seeds and the differences, with 95 % intervals.
 import argparse
 import sys
 
-import mace_rl  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
+import mace_rl.pins  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
 
 import gymnasium
 import numpy as np

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import mace_rl  # noqa: F401  isort: skip  (pins NumPy before it is imported)
+import mace_rl.pins  # noqa: F401  isort: skip  (pins NumPy before it is imported)
 
 import gymnasium
 import pytest
@@ -131,7 +131,7 @@ def kill(monkeypatch):
     from shared import Killed
 
     from mace_rl.runs import run
-    from mace_rl.train import Trainer
+    from mace_rl.trainer import Trainer
 
     improve = Trainer.improve
 

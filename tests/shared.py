@@ -22,7 +22,7 @@ from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetworks
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.files import LOCK
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]

@@ -15,7 +15,7 @@ from mace_rl.results.paper import CARTPOLE, HOPPER
 @pytest.mark.parametrize("environment", [CARTPOLE, HOPPER])
 @pytest.mark.parametrize("variant", ["ppo", "mace_full"])
 def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, environment, variant):
-    from mace_rl.train import Trainer
+    from mace_rl.trainer import Trainer
 
     for _, module, name in breakdown.FUNCTIONS:  # put back after the test
         owner = importlib.import_module(module)

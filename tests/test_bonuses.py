@@ -23,7 +23,7 @@ from mace_rl.config.study import Study, read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 OTHERS = ["icm", "rnd", "hash_counts"]

@@ -13,11 +13,12 @@ from shared import GOOD, call, files
 from snakemake.utils import update_config
 
 from mace_rl import cli
+from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import load_study
 from mace_rl.runs import run
 
-CONFIG = yaml.safe_load(cli.CONFIG.read_text(encoding="utf-8"))
+CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 
 # What is changed in a good command, and what the message has to name.
 MISTAKES = {
@@ -28,6 +29,7 @@ MISTAKES = {
     "variant of a further study": ({"--variant": "beta_0.4"}, ["'beta_0.4'", "--config FILE"]),
     "seed beyond 32 bits": ({"--seed": "4294967296"}, ["4294967296"]),
     "no episodes": ({"--episodes": "0"}, ["--episodes", "0", "at least 1"]),
+    "no steps": ({"--max-episode-steps": "0"}, ["--max-episode-steps", "0", "at least 1"]),
     "config that is not there": ({"--config": "/nonexistent.yaml"}, ["/nonexistent.yaml"]),
     "config that is a folder": ({"--config": "/"}, ["/"]),
     "out below a file": ({"--out": f"{__file__}/run"}, ["test_cli.py"]),
@@ -91,7 +93,7 @@ def test_settings_that_do_not_fit_the_environment_get_one_line(name, monkeypatch
 @pytest.mark.parametrize("order", [("exploration", "controls"), ("controls", "exploration")])
 def test_runs_of_combined_studies_are_those_of_the_workflow(order):
     """As Snakemake's own function reads the files over each other."""
-    paths = [cli.CONFIG.parent / "config" / f"{name}.yaml" for name in order]
+    paths = [DEFAULTS.parent / "config" / f"{name}.yaml" for name in order]
     merged = json.loads(json.dumps(CONFIG))
     for path in paths:
         update_config(merged, yaml.safe_load(path.read_text(encoding="utf-8")))
@@ -219,7 +221,7 @@ def test_results_that_are_damaged_or_of_other_code_are_not_this_run(monkeypatch,
         code, message = call(monkeypatch, *words)
         (tmp_path / name).write_bytes(whole[name])
         assert code == 1 and "\n" not in message and str(tmp_path) in message
-        for fragment in (*expected, "choose another --out, or remove the folder"):
+        for fragment in (*expected, "choose another folder, or remove this one"):
             assert fragment in message
 
     for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):

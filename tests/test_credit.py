@@ -17,7 +17,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.experience import Experience
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 # --- The meta gradient --------------------------------------------------------------------------
 

@@ -38,6 +38,7 @@ def test_the_archive_is_the_commit_and_its_checksums_hold(clone, tmp_path):
     assert {"environment.lock", "LICENSE", "reference/README.md"} <= files
     assert all((folder / path).read_bytes() == (clone / path).read_bytes() for path in tracked)
     assert (folder / ".ci/run").stat().st_mode & 0o111
+    assert (folder / "src/mace_rl/config/defaults.yaml").is_symlink()
     with (tmp_path / name).open("rb") as file:
         said = subprocess.run(["git", "get-tar-commit-id"], stdin=file, capture_output=True)
     assert said.stdout.decode() == run("git", "rev-parse", "HEAD", cwd=clone)

@@ -10,7 +10,7 @@ from mace_rl.agent.ppo import PPO, Batch
 from mace_rl.config.section import ConfigError
 from mace_rl.runs.agent import Agent, load_agent
 from mace_rl.streams import Streams
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 DICTIONARY = {"kind": "dictionary", "capacity": 2000, "neighbours": 10}
 DICTIONARY |= {"kernel_bandwidth": 0.05, "learning_rate": 0.1}

@@ -13,7 +13,7 @@ from tensorboardX.proto.event_pb2 import Event
 
 from mace_rl import files
 from mace_rl.runs import checkpoint
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 RUN = "CartPole-v1/mace_full/seed0"
 

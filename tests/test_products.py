@@ -109,10 +109,10 @@ def test_elementary_functions_at_the_ends():
 
 
 DIGEST = """
-import mace_rl, hashlib, numpy as np
+import mace_rl.pins, hashlib, numpy as np
 from mace_rl.agent import products
-from mace_rl.train import Trainer
-from mace_rl.cli import CONFIG
+from mace_rl.trainer import Trainer
+from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.study import read_study
 draw = np.random.default_rng(0)
 found = hashlib.sha256()
@@ -121,7 +121,7 @@ for rows, count, columns in [(1, 64, 512), (5, 3, 16), (13, 64, 80), (64, 256, 6
     c = np.empty((rows, columns), np.float32)
     products.product(a.astype(np.float32), b.astype(np.float32), np.zeros(columns, np.float32), c)
     found.update(c.tobytes())
-config = read_study([CONFIG]).run_config("CartPole-v1", "mace_full", 0)
+config = read_study([DEFAULTS]).run_config("CartPole-v1", "mace_full", 0)
 trainer = Trainer(config.model_copy(update={"episodes": 40}))
 for _ in trainer.run():
     pass

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Tuple
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from shared import ENGINES, environment_of
 
 from mace_rl.agent.network import mlp
@@ -256,7 +256,6 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
     [
         ({}, None, "has no time limit .*set one"),
         ({"observation_space": MultiBinary(3)}, 10, "multibinary observations.*Discrete ones work"),
-        ({"observation_space": Tuple([Discrete(3)] * 2)}, 10, "tuple observations, Tuple"),
         ({"observation_space": Box(0, 255, (8, 8, 3), np.uint8)}, 10, "image observations, Box"),
         ({"action_space": MultiDiscrete([2, 2])}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, (2, 2))}, 10, "Discrete and one-dim"),
@@ -269,6 +268,16 @@ def test_environments_that_do_not_fit_are_refused_by_name(register, spaces, limi
         register("Unfit-v0", type("Unfit", (gymnasium.Env,), plain | spaces), limit)
     with pytest.raises(ConfigError, match=rf"^[^\n]*Unfit-v0[^\n]*{message}[^\n]*$"):
         environment_of("Unfit-v0")
+
+
+def test_tuples_are_flattened():
+    """Blackjack: what the player has, what the dealer shows, an ace; one-hot, in a row."""
+    environment = environment_of("Blackjack-v1", 0, 5)
+    noise = draw_noise(environment, np.random.default_rng(0))
+    policy = uniform_policy(environment)
+    episode = rollout_for(environment, policy)(environment, policy, noise)
+    parts = np.split(episode.observations, [32, 32 + 11], axis=1)
+    assert all((part.sum(axis=1) == 1).all() for part in parts)
 
 
 def test_settings_reach_the_environment():

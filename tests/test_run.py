@@ -40,7 +40,7 @@ from mace_rl.environments import hopper
 from mace_rl.files import LOCK
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 # --- What a run leaves --------------------------------------------------------------------------
 
@@ -237,7 +237,7 @@ def test_a_process_of_its_own_is_killed_and_resumed_by_another(
     assert {"numpy", "scipy"} < {Path(library).parts[-2].partition(".")[0] for library in threads}
     assert set(threads.values()) == {1}
     assert {*map(Path, imported)} <= {*sources.files("training")}
-    assert {Path(name).name for name in imported} >= {"train.py", "ppo.py", "run.py"}
+    assert {Path(name).name for name in imported} >= {"trainer.py", "ppo.py", "run.py"}
     with caplog.at_level(logging.INFO):
         assert len(completes(config, directory)["interruptions"]) == 1
     assert 0 < episode < 20 and "resuming after episode" in caplog.text

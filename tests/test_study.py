@@ -83,7 +83,9 @@ environments: [CliffWalking-v1]  # environment, settings.CliffWalking-v1.max_epi
 environment_settings: {Blackjack-v1: {}}  # time limit, settings.Blackjack-v1.max_episode_steps
 environment_settings: {CliffWalking-v1: {max_episode_steps: 0}}  # CliffWalking-v1, steps, 0
 environments: [LunarLander-v3]  # environment, 'LunarLander-v3', installed
-environments: [phys2d/CartPole-v1]  # environment, 'phys2d/CartPole-v1', letters
+environments: [phys2d/CartPole-v1]  # environment, 'phys2d/CartPole-v1', installed
+environments: [a/b/CartPole-v1]  # environment, 'a/b/CartPole-v1', a namespace and '/'
+environments: [phys2d+CartPole-v1]  # environment, 'phys2d+CartPole-v1', letters
 environments: [../x]  # '../x', letters
 environments: [MountainCar-v0]  # metrics.random_return.MountainCar-v0, missing
 environments: [CartPole-v1, CartPole-v1]  # environments, 'CartPole-v1' should be there once

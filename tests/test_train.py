@@ -17,7 +17,7 @@ from mace_rl.finite import NonFiniteError
 from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}
 AS_THEY_ARE = dict.fromkeys(("normalise_observations", "scale_rewards", "scale_advantages"), False)

@@ -18,7 +18,7 @@ from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.evaluate import evaluate
 from mace_rl.runs.run import run
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 

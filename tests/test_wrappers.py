@@ -24,7 +24,7 @@ from mace_rl.bonus.novelty import Novelty
 from mace_rl.config.beta import RandomBeta
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.config.wrappers import MEMORY, NOVELTY, CuriosityConfig
+from mace_rl.config.wrappers import CuriosityConfig, defaults
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
@@ -79,8 +79,8 @@ class ByEpisodes:
 
     def __init__(self, space, size: int, beta: BetaController | float, seed: int) -> None:
         self.beta = beta
-        memory = MemoryConfig(**MEMORY | SMALL["memory"])
-        novelty = NoveltyConfig(**NOVELTY | SMALL["novelty"])
+        memory = MemoryConfig(**defaults()["memory"] | SMALL["memory"])
+        novelty = NoveltyConfig(**defaults()["novelty"] | SMALL["novelty"])
         self.curiosity = Curiosity(memory, novelty, "torch", space, size, Streams(seed))
         self.sums = [[], []]  # discounted, of extrinsic rewards and of bonuses
 
@@ -383,7 +383,7 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
 def test_defaults_are_the_study_s_and_both_forms_show_them():
     file = Path(__file__).parents[1] / "config.yaml"
     training = yaml.safe_load(file.read_text(encoding="utf-8"))["training"]
-    assert training["memory"] == MEMORY and training["novelty"] == NOVELTY
+    assert defaults() == {name: training[name] for name in ("memory", "novelty")}
     single, vector = (
         list(inspect.signature(wrapper).parameters.values())[1:]
         for wrapper in (CuriosityReward, VectorCuriosityReward)

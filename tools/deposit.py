@@ -34,14 +34,14 @@ def git(repository: Path, *arguments: str) -> bytes:
     return run.stdout
 
 
-def committed(repository: Path) -> dict[str, tuple[bytes, int]]:
-    """Content and mode of each file at HEAD; `DepositError` if the tree is not what is there."""
+def committed(repository: Path) -> dict[str, tuple[bytes, int, str]]:
+    """Content, mode and what it links to of each file at HEAD; `DepositError` if there is more."""
     if changed := git(repository, "status", "--porcelain").decode().splitlines():
         more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         raise DepositError(f"not committed: {changed[0][3:]}{more}")
     with tarfile.open(fileobj=io.BytesIO(git(repository, "archive", "HEAD"))) as tar:
         members = ((member, tar.extractfile(member)) for member in tar.getmembers())
-        return {m.name: (file.read(), m.mode & 0o100) for m, file in members if file is not None}
+        return {m.name: (f.read(), m.mode & 0o100, m.linkname) for m, f in members if f is not None}
 
 
 def deposit(repository: Path) -> tuple[str, bytes]:
@@ -49,18 +49,19 @@ def deposit(repository: Path) -> tuple[str, bytes]:
     found = committed(repository)
     project = tomllib.loads(found["pyproject.toml"][0].decode())["project"]
     root = f"{project['name']}-{project['version']}"
-    sums = {name: hashlib.sha256(data).hexdigest() for name, (data, _) in found.items()}
+    sums = {name: hashlib.sha256(data).hexdigest() for name, (data, *_) in found.items()}
     lines = "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
-    found[SUMS] = lines.encode(), 0
+    found[SUMS] = lines.encode(), 0, ""
     commit, seconds = git(repository, "log", "-1", "--format=%H %ct").decode().split()
     buffer = io.BytesIO()
     named = {"comment": commit}  # where git itself puts it: `git get-tar-commit-id` reads it
     with tarfile.open(
         fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT, pax_headers=named
     ) as tar:
-        for name, (data, executable) in sorted(found.items()):
+        for name, (data, executable, link) in sorted(found.items()):
             member = tarfile.TarInfo(f"{root}/{name}")
-            member.size, member.mtime = len(data), int(seconds)
+            member.size, member.mtime = 0 if link else len(data), int(seconds)
+            member.type, member.linkname = tarfile.SYMTYPE if link else tarfile.REGTYPE, link
             member.mode = 0o755 if executable else 0o644
             tar.addfile(member, io.BytesIO(data))
     return f"{root}.tar", buffer.getvalue()

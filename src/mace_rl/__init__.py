@@ -1,19 +1,25 @@
-"""MACE-RL: PPO with episodic memory, curiosity and a meta-learnt curiosity weight β."""
+"""MACE-RL: PPO with episodic memory, curiosity and a meta-learnt curiosity weight β.
 
-import os
-import sys
-from pathlib import Path
+    from mace_rl import CuriosityReward, VectorCuriosityReward, load_agent, settings, train
 
-from mace_rl.pins import pin
-from mace_rl.sources import PACKAGE, digest
+Each is imported when it is asked for. Importing changes nothing in the process; the commands import
+`mace_rl.pins` as well, which does.
+"""
 
-pin()  # before NumPy and what computes with it is imported
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-# numba's cache on disk does not notice an edit in another file than the cached function's own, so
-# each state of this package gets a folder to itself. numba reads the variable when it is imported.
-_cache = Path(os.environ.get("NUMBA_CACHE_DIR", PACKAGE / "__pycache__" / "numba"))
-_state = digest("everything")[:16]
-_cache = _cache if _cache.name == _state else _cache / _state
-os.environ["NUMBA_CACHE_DIR"] = str(_cache)
-if "numba" in sys.modules:
-    sys.modules["numba"].config.CACHE_DIR = str(_cache)
+if TYPE_CHECKING:
+    from mace_rl.library import settings, train
+    from mace_rl.runs.agent import load_agent
+    from mace_rl.wrappers import CuriosityReward, VectorCuriosityReward
+
+__all__ = ["CuriosityReward", "VectorCuriosityReward", "load_agent", "settings", "train"]
+
+_PLACES = {"load_agent": "runs.agent", "settings": "library", "train": "library"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'mace_rl' has no attribute {name!r}")
+    return getattr(import_module(f"mace_rl.{_PLACES.get(name, 'wrappers')}"), name)

@@ -1,5 +1,7 @@
 """The command `mace-rl`: train one run, evaluate or film its agent, export records, repeat runs."""
 
+import mace_rl.pins  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
+
 import argparse
 import logging
 import sys
@@ -9,14 +11,13 @@ from typing import Any
 
 from mace_rl import files
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check
-from mace_rl.config.study import read_study
+from mace_rl.config.section import ConfigError
+from mace_rl.config.study import folder_of
+from mace_rl.library import settings
 from mace_rl.refusal import Refusal
-from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.finished import finished
 
 logger = logging.getLogger(__name__)
-
-CONFIG = Path(__file__).parents[2] / "config.yaml"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -40,10 +41,11 @@ def parser() -> argparse.ArgumentParser:
         "carry out one training run; the same command resumes it if interrupted",
         "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
     )
-    add("--env", required=True, help="a registered Gymnasium id")
+    add("--env", required=True, help="a Gymnasium id: Id, Namespace/Id or module:Id")
     add("--variant", required=True, help="one of the config's variant_settings")
-    add("--seed", required=True, type=int)
+    add("--seed", default=0, type=int, help="(default: 0)")
     add("--episodes", type=int, help="instead of the config's budget")
+    add("--max-episode-steps", type=int, help="instead of the environment's own time limit")
     add(
         "--config",
         type=Path,
@@ -51,14 +53,14 @@ def parser() -> argparse.ArgumentParser:
         action="extend",
         default=[],
         metavar="FILE",
-        help="YAML files read over the project's config.yaml, one after the other",
+        help="YAML files read over the default settings, one after the other",
     )
     add(
         "--engine",
         choices=["compiled", "torch"],
         help="of every network: compiled (default) or plain PyTorch, slower, to check it by",
     )
-    add("--out", required=True, type=Path, help="folder for the results")
+    add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
     add = command(
         "status",
         "print how far the workflow's runs are, and about when they will be done",
@@ -104,6 +106,13 @@ def parser() -> argparse.ArgumentParser:
     add("folder", type=Path, help="of a run, or with runs below it")
     add("--out", type=Path, help="folder for the event files (default: beside the records)")
     add = command(
+        "export",
+        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ...",
+        "cartpole_run --out runs.csv",
+    )
+    add("folder", type=Path, help="of a run, or with runs below it")
+    add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")
+    add = command(
         "verify",
         "repeat kept runs and compare to the bit",
         "reference --sample 1",
@@ -115,20 +124,17 @@ def parser() -> argparse.ArgumentParser:
 
 def run_config(arguments: argparse.Namespace) -> RunConfig:
     """The run that the command line asks for; raises `ConfigError`."""
-    study = read_study([CONFIG, *arguments.config])
-    try:
-        config = study.run_config(arguments.env, arguments.variant, arguments.seed)
-    except ConfigError as error:
-        if arguments.variant in study.variant_settings:
-            raise
-        raise ConfigError(f"{error}; variants of further studies need --config FILE") from None
-    changes: dict[str, object] = {}
-    if arguments.episodes is not None:
-        _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
-        changes["episodes"] = arguments.episodes
-    if arguments.engine is not None:
-        changes["engine"] = arguments.engine
-    return config.model_copy(update=changes)
+    changes = {key: getattr(arguments, key) for key in ("episodes", "max_episode_steps", "engine")}
+    for key in ("episodes", "max_episode_steps"):
+        option, value = f"--{key.replace('_', '-')}", changes[key]
+        _require(value is None or value >= 1, option, value, "be at least 1")
+    return settings(
+        arguments.env,
+        arguments.variant,
+        seed=arguments.seed,
+        config=arguments.config,
+        **{key: value for key, value in changes.items() if value is not None},
+    )
 
 
 def _require(fits: bool, option: str, value: object, right: str) -> None:
@@ -137,48 +143,20 @@ def _require(fits: bool, option: str, value: object, right: str) -> None:
         raise ConfigError(f"{option} is {value!r}, but should {right}")
 
 
-def finished(config: RunConfig, directory: Path) -> bool:
-    """Whether `directory` holds the results of this run, whole and as it would come out now.
-
-    Raises `ConfigError` if they are damaged, of another run, or of other code or versions, as a
-    checkpoint of those is not continued.
-    """
-    if not (directory / files.RECORD).exists():
-        return False
-    way_out = "choose another --out, or remove the folder"
-    content = read_record(directory / files.RECORD)
-    # Imported here: PyTorch takes seconds, and a mistake in the command should not.
-    from mace_rl.runs.checkpoint import difference
-    from mace_rl.runs.run import run_identity
-
-    wanted = run_identity(config)
-    found = {key: content[key] for key in wanted}
-    found["config"] = check(RunConfig, found["config"], str(directory / files.RECORD)).settings()
-    if found != wanted:
-        code = " or ".join([*config.references().values(), "mace_rl"])
-        only_code = found | {"sources": wanted["sources"]} == wanted
-        other = f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"
-        raise ConfigError(f"{directory} holds a finished run {other}; {way_out}")
-    for path in (directory / name for name in files.RESULTS):
-        if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
-            raise ConfigError(
-                f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {way_out}"
-            )
-    return True
-
-
 def train(arguments: argparse.Namespace) -> None:
     """`mace-rl train`."""
     config = run_config(arguments)
-    if finished(config, arguments.out):
-        (arguments.out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
-        logger.info("%s holds this run already, finished", arguments.out)
+    default = Path("runs", folder_of(config.environment), config.variant, f"seed{config.seed}")
+    out: Path = arguments.out or default
+    if finished(config, out):
+        (out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
+        logger.info("%s holds this run already, finished", out)
         return
-    from mace_rl.runs import progress, run  # not above: see `finished`
+    from mace_rl.runs import progress, run  # PyTorch takes seconds, a mistake should not
 
     with progress.line(sys.stderr) as observe:
-        run.run(config, arguments.out, observe)
-    logger.info("finished: %s", arguments.out / files.EPISODES)
+        run.run(config, out, observe)
+    logger.info("finished: %s", out / files.EPISODES)
 
 
 def status(arguments: argparse.Namespace) -> None:
@@ -244,6 +222,17 @@ def tensorboard(arguments: argparse.Namespace) -> None:
     logger.info("runs: %d; look at them with: tensorboard --logdir %s", count, out)
 
 
+def export(arguments: argparse.Namespace) -> None:
+    """`mace-rl export`."""
+    out: Path = arguments.out
+    _require(out.suffix in (".csv", ".parquet"), "--out", str(out), "end in .csv or .parquet")
+    from mace_rl.runs import export
+
+    table = export.columns(arguments.folder)
+    export.write(table, out)
+    logger.info("%d episodes: %s", len(table["task"]), out)
+
+
 def verify(arguments: argparse.Namespace) -> None:
     """`mace-rl verify`."""
     sample = arguments.sample
@@ -263,6 +252,7 @@ def main() -> None:
         "evaluate": evaluate,
         "watch": watch,
         "tensorboard": tensorboard,
+        "export": export,
         "verify": verify,
     }
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -270,6 +260,13 @@ def main() -> None:
         commands[arguments.command](arguments)
     except (Refusal, OSError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
+    except ModuleNotFoundError as error:
+        if (
+            arguments.command == "train"
+        ):  # in code of the user's own, whose place the traceback tells
+            raise
+        extra = "tensorboard" if arguments.command == "tensorboard" else "study"
+        sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
     except KeyboardInterrupt:
         resumes = arguments.command == "train"
         logger.info("interrupted%s", "; the same command resumes it" if resumes else "")

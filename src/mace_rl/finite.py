@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from mace_rl.compiling import njit
 from mace_rl.refusal import Refusal
 
 

@@ -4,7 +4,8 @@ What trains compiled networks gives the same bits on every processor by construc
 (`agent.products`). Beside it stand libraries that look at the processor when they are loaded, and
 whose sums differ in the last bit: NumPy and OpenBLAS where tables and figures are made and where
 Hopper turns a vector, PyTorch where a network is a torch module of one's own. They can be told
-otherwise by variables that each reads once.
+otherwise by variables that each reads once. Importing this module sets them, before any of these
+libraries is loaded: the commands and the workflow do; `import mace_rl` alone does not.
 """
 
 import os
@@ -21,7 +22,7 @@ PINS = {
 
 
 def pin() -> None:
-    """Set what the libraries read; importing `mace_rl` does, before any of them is loaded.
+    """Set what the libraries read.
 
     Not where the processor lacks AVX2: a library told to use it would end the process.
     """
@@ -31,3 +32,6 @@ def pin() -> None:
         return
     if features.get("avx2") and features.get("fma"):
         os.environ.update(PINS)
+
+
+pin()

@@ -119,7 +119,8 @@ class CuriosityReward(Curious, gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, total, terminated, truncated, {**info, **parts}
 
 
-class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+# Gymnasium's class takes no types as arguments before its version 1.3.
+class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper):
     """`CuriosityReward` for environments that are stepped together and share what is known.
 
     What was seen in one of them is known in all as soon as its episode has ended. Arguments are

@@ -1,5 +1,6 @@
 # The study as the configuration describes it, checked, and what all rules share of it.
 
+import mace_rl.pins  # before NumPy: equal bits on every processor; the jobs inherit it
 import json
 import os
 import re
@@ -7,12 +8,12 @@ import shlex
 import sys
 from pathlib import Path
 
-import gymnasium
 from mace_rl import files
 from mace_rl.config.reading import merge, read_yaml, typed
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import load_study
+from mace_rl.config.study import folder_of, load_study
 from mace_rl.config.plugins import source_file
+from mace_rl.environments import registered
 from mace_rl.results import paper, protocol
 from mace_rl.results.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
@@ -41,7 +42,10 @@ except ConfigError as error:
 RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
-EPISODES = [f"{RUN}/{files.EPISODES}".format(env=e, variant=v, seed=s) for e, v, s in RUNS]
+FOLDERS = {folder_of(env): env for env in study.environments}
+EPISODES = [
+    f"{RUN}/{files.EPISODES}".format(env=folder_of(e), variant=v, seed=s) for e, v, s in RUNS
+]
 RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
 HAS_PAPERS = paper.has_all(study.environments, study.variants)
 # The ledger is for a study that has all of the protocol's claims or questions, and one bar for all.
@@ -71,14 +75,14 @@ def one_of(values):
 
 
 wildcard_constraints:
-    env=one_of(study.environments),
+    env=one_of(FOLDERS),
     variant=one_of(study.variants),
     seed=one_of({seed: None for _, _, seed in RUNS}),
 
 
 def run_config(wildcards):
     """All that determines a run besides the code."""
-    return study.run_config(wildcards.env, wildcards.variant, int(wildcards.seed))
+    return study.run_config(FOLDERS[wildcards.env], wildcards.variant, int(wildcards.seed))
 
 
 def ppo_settings():
@@ -95,7 +99,7 @@ def ppo_settings():
 def most_work(wildcards):
     """A measure of how long a run can take: long ones start first, and no core idles at the end."""
     config = run_config(wildcards)
-    own_limit = gymnasium.registry[config.environment.rpartition(":")[2]].max_episode_steps
+    own_limit = registered()[config.environment.rpartition(":")[2]].max_episode_steps
     steps = config.episodes * (config.max_episode_steps or own_limit)
     return steps if config.beta.kind == "none" else 2 * steps
 

@@ -12,10 +12,10 @@ multiples of 16, so columns of zeros are added. Their gradient is 0, so they sta
 import math
 
 import numpy as np
-from numba import njit
 
 from mace_rl.agent.elementary import exp, log, tanh
 from mace_rl.agent.products import add_product, address, by_tiles, dot, padded, product
+from mace_rl.compiling import njit
 
 # Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
 kernel = njit(cache=True, error_model="numpy")

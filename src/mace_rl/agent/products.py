@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from mace_rl.agent.elementary import fma
+from mace_rl.compiling import njit
 
 LANES = 16  # columns of B and C come in multiples of this, filled up with zeros
 WIDE = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")

@@ -10,6 +10,9 @@ from mace_rl.config.section import ConfigError, short
 
 Settings = dict[str, Any]
 
+# Every default: in the project the file config.yaml, of which an installation has a copy.
+DEFAULTS = Path(__file__).with_name("defaults.yaml").resolve()
+
 
 def read_yaml(path: Path) -> Settings:
     """The mapping in a YAML file; `ConfigError` if there is none or a key occurs twice."""

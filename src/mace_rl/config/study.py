@@ -11,27 +11,30 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
-import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
-from matplotlib.colors import is_color_like
 from pydantic import AfterValidator, Field, ValidationError
 
-import mace_rl.environments  # noqa: F401  (registers our own)
 from mace_rl.config.plugins import import_module, load, source_file
 from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
 from mace_rl.config.results import GOALS, FigureConfig, MetricsConfig
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, explain, short
+from mace_rl.environments import registered
 
-# Environments and variants name folders and appear in Snakemake's patterns; an environment may
-# name its module too, as in Gymnasium: package.module:Id.
+# Environments and variants name folders and appear in Snakemake's patterns. An environment may have
+# more, as in Gymnasium: package.module:Namespace/Id.
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 
 
 def _colour(name: str) -> str:
+    try:
+        from matplotlib.colors import is_color_like
+    except ImportError:
+        return name  # nothing is drawn without
     if not is_color_like(name):
         raise ValueError("it should be a colour of Matplotlib's, such as tab:blue or '#1f77b4'")
     return name
@@ -115,17 +118,22 @@ class Study(Section):
         places = {name: f"C{place}" for place, name in enumerate(self.variant_settings)}
         return {name: self.variant_settings[name].colour or places[name] for name in self.variants}
 
-    def run_config(self, environment: str, variant: str, seed: int) -> RunConfig:
-        """The settings of one run: `training`, then the environment's, then the variant's.
+    def run_config(
+        self, environment: str, variant: str, seed: int, changes: Settings | None = None
+    ) -> RunConfig:
+        """The settings of one run: `training`, the environment's, the variant's, then `changes`.
 
         They need no place in the study's lists. Raises `ConfigError` for what cannot be.
         """
-        if (environment, variant) not in self._resolved:
+        found = None if changes else self._resolved.get((environment, variant))
+        if found is None:
             _check_known(variant, self.variant_settings, "variant", "variant_settings")
-            self._resolved[environment, variant] = _resolve(self, environment, variant)
-        if not 0 <= seed < 2**32:
-            raise ConfigError(f"seed is {seed}, but should be from 0 to 4294967295")
-        return self._resolved[environment, variant].model_copy(update={"seed": seed})
+            found = _resolve(self, environment, variant, changes or {})
+            if not changes:
+                self._resolved[environment, variant] = found
+        if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
+            raise ConfigError(f"seed is {seed!r}, but should be from 0 to 4294967295")
+        return found.model_copy(update={"seed": int(seed)})
 
 
 def load_study(config: Mapping[Any, Any], origin: str) -> Study:
@@ -161,7 +169,7 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
             for environment in getattr(study.metrics, key):
                 if environment not in known and ":" not in environment:
                     _check_known(
-                        environment, gymnasium.registry, f"metrics.{key}", "Gymnasium's registry"
+                        environment, registered(), f"metrics.{key}", "Gymnasium's registry"
                     )
         for reference in study.metrics.custom:
             load(reference, "metrics.custom")
@@ -170,25 +178,34 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     return study
 
 
-def read_study(paths: Sequence[Path]) -> Study:
+def folder_of(environment: str) -> str:
+    """What the folder of an environment's runs is called; no id has the '+' that stands for '/'."""
+    return environment.replace("/", "+")
+
+
+def read_study(paths: Sequence[Path], every_run: bool = True) -> Study:
     """The study of one YAML file and others read over it: mappings merge, lists are replaced.
 
-    Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a file
-    gives twice, and everything that `load_study` refuses.
+    Without `every_run` each is checked when it is asked for, and packages that others need may be
+    missing. Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a
+    file gives twice, and everything that `load_study` refuses.
     """
     config: Settings = {}
     for path in paths:
         config = merge(config, read_yaml(path))
-    return load_study(config, " + ".join(str(path) for path in paths))
+    origin = " + ".join(str(path) for path in paths)
+    return load_study(config, origin) if every_run else check(Study, config, origin)
 
 
-def _resolve(study: Study, environment: str, variant: str) -> RunConfig:
+def _resolve(study: Study, environment: str, variant: str, changes: Settings) -> RunConfig:
     """The checked settings of one environment and variant, for seed 0."""
     layers = {
         "training": study.training,
         f"environment_settings.{environment}": study.environment_settings.get(environment, {}),
         f"variant_settings.{variant}": study.variant_settings[variant].settings,
     }
+    if changes:
+        layers["the changes"] = changes
     settings: Settings = {}
     for name, layer in layers.items():
         for key in IDENTITY:
@@ -228,11 +245,12 @@ def _depth(layer: Any, location: Iterable[Any]) -> int:
 
 
 def _check_name(environment: str, key: str) -> None:
-    if not re.fullmatch(rf"({SAFE_NAME}:)?{SAFE_NAME}", environment):
+    extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
+    if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment):
         raise ConfigError(
             f"{key} has {environment!r}, but a name here becomes a folder: it should consist of "
-            "letters, digits, '.', '_' and '-', and begin with a letter or digit; a module and "
-            "':' may stand before it"
+            "letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
+            "environment's may stand a module and ':', then a namespace and '/'"
         )
 
 
@@ -241,14 +259,21 @@ def _check_environment(config: RunConfig) -> None:
     name, key = config.environment, "environment"
     if ":" in name:
         import_module(name, key)  # which registers it
-    registered = name.rpartition(":")[2]
-    if registered not in gymnasium.registry:
-        _check_known(registered, list(gymnasium.registry), key, "Gymnasium's registry")
-    spec = gymnasium.registry[registered]
+    own = name.rpartition(":")[2]
+    if own not in registered():
+        if "Bullet" in own and importlib.util.find_spec("pybullet_envs_gymnasium") is None:
+            raise ConfigError(
+                f"{key} has {name!r}, but the package it needs should be installed: "
+                "mace-rl's extra [study] has it"
+            )
+        hint = "" if ":" in name else f" (if a module registers it: module:{name})"
+        _check_known(own, registered(), key, f"Gymnasium's registry{hint}")
+    spec = registered()[own]
     if (config.max_episode_steps or spec.max_episode_steps) is None:
         raise ConfigError(
             f"{key} has {name!r}, which has no time limit of its own, so that its episodes need "
-            f"not end: environment_settings.{name}.max_episode_steps should set one"
+            f"not end: --max-episode-steps or environment_settings.{name}.max_episode_steps should "
+            "set one"
         )
     if isinstance(spec.entry_point, str):
         try:  # imports the packages around the environment's module, not that module

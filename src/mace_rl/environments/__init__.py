@@ -3,8 +3,10 @@
 Planning the workflow needs the ids, and neither PyBullet nor numba nor torch: classes are named.
 """
 
+from contextlib import suppress
+
 import gymnasium
-from gymnasium.envs.registration import WrapperSpec
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 gymnasium.register(
     "SparseMountainCar-v0", "mace_rl.environments.tasks:SparseMountainCar", max_episode_steps=200
@@ -55,3 +57,10 @@ for name, flag in {"Help": "right", "Harm": "wrong", "Nothing": "random"}.items(
         max_episode_steps=32,
         kwargs={"flag": flag},
     )
+
+
+def registered() -> dict[str, EnvSpec]:
+    """Gymnasium's registry, with Bullet's environments if they are installed."""
+    with suppress(ImportError):
+        import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
+    return gymnasium.registry

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mace_rl.agent.kernels import act_discrete
+from mace_rl.compiling import njit
 
 CARTPOLE, ACROBOT = 0, 1
 

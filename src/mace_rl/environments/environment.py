@@ -9,10 +9,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
+from gymnasium.spaces import Dict, Tuple
+from gymnasium.wrappers import FlattenObservation
 
 from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError
+from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
 
 # Environments for which we have a faster class that behaves the same to the bit.
@@ -52,6 +54,7 @@ class Environment(Spaces):
     ) -> None:
         if ":" in name:
             import_module(name, "environment")
+        registered()
         try:
             spec = copy.deepcopy(gymnasium.spec(name.rpartition(":")[2]))
         except gymnasium.error.Error as error:
@@ -72,6 +75,13 @@ class Environment(Spaces):
                     raise
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
                 raise ConfigError(f"environment {name!r} with {arguments}: {reason}") from None
+            except (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled) as error:
+                reason = " ".join(str(error).split())
+                raise ConfigError(
+                    f"environment {name!r} needs a package that should be installed: {reason}"
+                ) from None
+        if isinstance(self.env.observation_space, Tuple | Dict):
+            self.env = FlattenObservation(self.env)
         super().__init__(name, self.env.observation_space, self.env.action_space)
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh

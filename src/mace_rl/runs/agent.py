@@ -21,7 +21,7 @@ from mace_rl.config.section import check
 from mace_rl.environments.environment import Environment
 from mace_rl.runs.checkpoint import CheckpointError, unarchive
 from mace_rl.runs.provenance import file_digest, read_record
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 
 class PolicyModule(torch.nn.Module):

@@ -30,7 +30,7 @@ from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 logger = logging.getLogger(__name__)
 
@@ -52,19 +52,20 @@ def run(
     directory: Path,
     observe: Callable[[dict[str, Any]], None] | None = None,
     keep_checkpoint: bool = False,
+    after_episode: Callable[[EpisodeRecord], object] | None = None,
 ) -> None:
     """Train as `config` says and leave its results in `directory`.
 
-    Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`.
+    Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`; and
+    `after_episode` each episode, when the update that it was played for is done.
 
     Continues from its checkpoint if there is one of this very configuration, code and versions;
     otherwise says so in the log and starts afresh. With `keep_checkpoint` a last one stays, from
     which results that are deleted come back without training. Uses one thread. Raises `RunError`
     if another process is at work in `directory`.
     """
-    torch.set_num_threads(1)
     directory.mkdir(parents=True, exist_ok=True)
-    with exclusive(directory), threadpool_limits(1):
+    with exclusive(directory), threadpool_limits(1), left_alone():
         for half_written in directory.glob(".*.tmp"):  # by a process that was killed
             half_written.unlink()
         started = time.monotonic()
@@ -89,7 +90,10 @@ def run(
             }
             checkpoint.save(directory / files.CHECKPOINT, identity, state)
 
-        for _ in trainer.run():
+        for records in trainer.run():
+            if after_episode:
+                for record in records:
+                    after_episode(record)
             if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
                 clock.start_seconds = time.monotonic() - started
             if clock.progress_due():
@@ -185,6 +189,18 @@ def between_checkpoints() -> float:
     if not 0 <= seconds < math.inf:
         raise RunError(f"{CHECKPOINT_VARIABLE} is {said!r}, but should be a number of seconds")
     return seconds
+
+
+@contextmanager
+def left_alone() -> Iterator[None]:
+    """One thread for PyTorch, and nothing frozen for the collector, when this is over as before."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        gc.unfreeze()
 
 
 @contextmanager

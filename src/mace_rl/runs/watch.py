@@ -19,7 +19,7 @@ from mace_rl.environments.environment import Environment, nothing_printed
 from mace_rl.environments.rollout import draw_noise, roll_out
 from mace_rl.runs.agent import acting, load_acting
 from mace_rl.runs.provenance import read_record
-from mace_rl.train import Trainer
+from mace_rl.trainer import Trainer
 
 # pygame needs neither a screen nor a loudspeaker to draw into memory, and should not look for them.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

@@ -1,0 +1,31 @@
+"""numba's `njit`, with a cache on disk that notices every edit of this package.
+
+numba's own does not notice an edit in another file than the cached function's. So each state of
+this package gets a folder to itself, set while a function of ours is decorated and not longer: what
+else is compiled in this process, a program of somebody's, has its cache where it had it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from mace_rl.sources import PACKAGE, digest
+
+config: Any = numba.config  # which it fills as it is imported
+# Where this cannot be written, numba takes the user's folder for caches.
+FOLDER = Path(config.CACHE_DIR or PACKAGE / "__pycache__" / "numba") / digest("everything")[:16]
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """The decorator `numba.njit(**options)`."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(FOLDER)
+        try:
+            return numba.njit(**options)(function)
+        finally:
+            config.CACHE_DIR = before
+
+    return compiled

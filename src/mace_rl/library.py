@@ -1,0 +1,85 @@
+"""Training from a program of one's own: `settings` of a run, and `train`.
+
+run = settings("CartPole-v1", "mace_full", seed=3, episodes=200, ppo={"clip": 0.1})
+agent, episodes = train(run, lambda episode: print(episode.extrinsic_return))
+action = agent.policy([0.0, 0.1, 0.0, -0.1]).sample()
+"""
+
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mace_rl import files
+from mace_rl.config.reading import DEFAULTS
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError
+from mace_rl.config.study import read_study
+from mace_rl.results.records import EpisodeRecord
+from mace_rl.runs.finished import finished, read_rows
+
+if TYPE_CHECKING:
+    from mace_rl.runs.agent import Agent
+
+
+class Trained(NamedTuple):
+    """What came of a training."""
+
+    agent: "Agent"  # as `load_agent` gives it
+    episodes: list[EpisodeRecord]
+
+
+def settings(
+    environment: str,
+    variant: str = "mace_full",
+    *,
+    seed: int = 0,
+    config: str | Path | Iterable[str | Path] = (),
+    **changes: Any,
+) -> RunConfig:
+    """The settings of one run: the defaults, `config` read over them, then `changes`.
+
+    environment: any id of Gymnasium's; "module:Id" imports the module first.
+    variant: what sets β: "ppo" (no bonus), "mace_fixed", "mace_full", or one of `config`.
+    config: YAML files like config.yaml. They may have further variants.
+    changes: any field of `RunConfig`, such as episodes=200, max_episode_steps=100 or
+        beta={"kind": "constant", "value": 0.2}. Sections merge: ppo={"clip": 0.1} changes that
+        alone.
+
+    Raises `ConfigError`, one line, for what cannot be.
+    """
+    over = [config] if isinstance(config, str | Path) else config
+    study = read_study([DEFAULTS, *map(Path, over)], every_run=False)
+    try:
+        return study.run_config(environment, variant, seed, changes)
+    except ConfigError as error:
+        if variant in study.variant_settings:
+            raise
+        raise ConfigError(
+            f"{error}; variants of further studies need --config FILE, or config=FILE"
+        ) from None
+
+
+def train(
+    settings: RunConfig,
+    callback: Callable[[EpisodeRecord], object] | None = None,
+    folder: str | Path | None = None,
+) -> Trained:
+    """Train to the last episode, in this process and on one thread.
+
+    settings: from the function of that name.
+    callback: is called with each episode after the update that it was played for.
+    folder: keeps the run, as `mace-rl train --out` does: the same call goes on with what was
+        interrupted, without calling back for its episodes again, and only reads what is finished.
+
+    Raises `ConfigError` if `folder` has the results of another run, and `NonFiniteError` as soon as
+    a number goes bad.
+    """
+    from mace_rl.runs.agent import load_agent  # torch takes seconds
+    from mace_rl.runs.run import run
+
+    with tempfile.TemporaryDirectory() as scratch:
+        directory = Path(folder or scratch)
+        if not finished(settings, directory):
+            run(settings, directory, after_episode=callback)
+        return Trained(load_agent(directory), read_rows(directory / files.EPISODES))

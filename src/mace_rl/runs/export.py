@@ -1,0 +1,63 @@
+"""Finished runs as one tidy table, a row per episode, for other people's tools."""
+
+from pathlib import Path
+from typing import Any
+
+from mace_rl import files
+from mace_rl.files import write_atomically
+from mace_rl.refusal import Refusal
+from mace_rl.results.records import RecordError
+from mace_rl.runs.finished import read_rows
+from mace_rl.runs.provenance import file_digest, read_record
+
+RUN = ("task", "algorithm", "seed")  # environment, variant, seed
+EPISODE = {  # our name of each other column; the step counts all of the run, this episode included
+    "step": "env_steps",
+    "return": "extrinsic_return",
+    "episode": "episode",
+    "length": "length",
+    "beta": "beta",
+}
+
+
+def columns(folder: Path) -> dict[str, list[Any]]:
+    """The table of every finished run in and below `folder`.
+
+    Raises `RecordError` if there are none, or two of the same name, or for damaged records.
+    """
+    table: dict[str, list[Any]] = {name: [] for name in (*RUN, *EPISODE)}
+    seen: dict[tuple[Any, ...], Path] = {}
+    for run in sorted(path.parent for path in folder.rglob(files.RECORD)):
+        record, episodes = read_record(run / files.RECORD), run / files.EPISODES
+        key = tuple(record["config"][name] for name in ("environment", "variant", "seed"))
+        if key in seen:
+            name = "{} {} seed {}".format(*key)
+            raise RecordError(f"{run}: {name} is in {seen[key]} too; export one of them alone")
+        seen[key] = run
+        if file_digest(episodes) != record["outputs"][files.EPISODES]:
+            raise RecordError(f"{episodes}: not the file that run.json describes (SHA-256 differs)")
+        rows = read_rows(episodes)
+        for name, value in zip(RUN, key, strict=True):
+            table[name] += [value] * len(rows)
+        for name, ours in EPISODE.items():
+            table[name] += [getattr(row, ours) for row in rows]
+    if not seen:
+        raise RecordError(f"{folder}: no finished run in it")
+    return table
+
+
+def write(table: dict[str, list[Any]], out: Path) -> None:
+    """Write the table as `out` ends: .csv or .parquet; `Refusal` without pyarrow for the latter."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".csv":
+        lines = (",".join(map(str, row)) for row in zip(*table.values(), strict=True))
+        write_atomically(out, "\n".join([",".join(table), *lines, ""]))
+        return
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        raise Refusal(f"--out is '{out}', but .parquet needs: pip install pyarrow") from None
+    sink = pyarrow.BufferOutputStream()
+    parquet.write_table(pyarrow.table(table), sink)
+    write_atomically(out, sink.getvalue().to_pybytes())

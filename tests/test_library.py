@@ -1,0 +1,142 @@
+"""The five names of `mace_rl`, in somebody's own program."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import requires, version
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from packaging.requirements import Requirement
+from shared import call
+
+import mace_rl
+from mace_rl import load_agent, settings, train
+from mace_rl.config.reading import DEFAULTS
+from mace_rl.config.section import ConfigError
+from mace_rl.results.records import read_episodes
+
+ROOT = Path(__file__).parents[1]
+HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]
+
+
+def told(code: str) -> list:
+    """What a new process prints as JSON."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_importing_loads_little_and_changes_nothing():
+    """Not even where numba keeps what somebody else compiles."""
+    loaded, changed, cache = told(
+        "import json, os, sys; before = dict(os.environ); import mace_rl.wrappers, numba; "
+        "print(json.dumps([list(sys.modules), before != os.environ, numba.config.CACHE_DIR]))"
+    )
+    assert not {*HEAVY} & {*loaded} and not changed
+    assert cache == os.environ.get("NUMBA_CACHE_DIR", "")
+    bare = told("import json, sys, mace_rl; print(json.dumps(list(sys.modules)))")
+    assert not {"numpy", "torch", "numba", "gymnasium"} & {*bare}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.pins"])
+def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
+    """As those say themselves, which read it when they are imported."""
+    numpy_has, torch_has = told(
+        f"import {module}, json, torch; from numpy._core._multiarray_umath import __cpu_features__;"
+        "print(json.dumps([__cpu_features__, torch.backends.cpu.get_cpu_capability()]))"
+    )
+    assert numpy_has["AVX2"] and not numpy_has["AVX512_SKX"] and torch_has == "AVX2"
+
+
+def test_each_name_is_what_its_module_has_and_no_other_is_there():
+    assert mace_rl.train.__module__ == mace_rl.settings.__module__ == "mace_rl.library"
+    assert mace_rl.CuriosityReward.__module__ == "mace_rl.wrappers"
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        mace_rl.trian  # noqa: B018
+
+
+def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text("variant_settings: {low: {beta: {kind: constant, value: 0.1}}}")
+    changes = {"episodes": 7, "ppo": {"clip": 0.1}}
+    found = settings("CartPole-v1", "low", seed=np.int64(3), config=file, **changes)
+    expected = run_config(seed=3, variant="mace_fixed", **changes).settings()
+    beta = {"kind": "constant", "value": 0.1}
+    assert found.settings() == expected | {"variant": "low", "beta": beta}
+    assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
+
+
+def test_the_package_s_defaults_are_config_yaml_itself():
+    """Not a copy: what one edits there is what a run by hand gets."""
+    assert DEFAULTS == ROOT / "config.yaml"
+
+
+MISTAKES = {
+    "unknown key 'ppo.clpi'": {"ppo": {"clpi": 0.1}},
+    "unknown key 'epsiodes' (value 3); the nearest known key is 'episodes'": {"epsiodes": 3},
+    "episodes is 0, but should be greater than 0": {"episodes": 0},
+    "variant has 'mace_ful'": {"variant": "mace_ful"},
+    "seed is 1.5": {"seed": 1.5},
+    "--max-episode-steps": {"environment": "Blackjack-v1"},
+    "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_a_mistake_gets_one_line(message):
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        settings(**{"environment": "CartPole-v1"} | MISTAKES[message])
+    assert "\n" not in str(caught.value)
+
+
+def test_train_is_the_command_and_calls_back_for_each_episode(monkeypatch, tmp_path):
+    options = {"--env": "CartPole-v1", "--variant": "mace_full", "--seed": "5", "--episodes": "8"}
+    command = ["train", *sum(options.items(), ()), "--out"]
+    assert call(monkeypatch, *command, str(tmp_path / "command")) == (0, "")
+    run, told = settings("CartPole-v1", "mace_full", seed=5, episodes=8), []
+    trained = train(run, told.append, tmp_path / "own")
+    for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):
+        one, other = ((tmp_path / folder / name).read_bytes() for folder in ("command", "own"))
+        assert one == other
+    frame = read_episodes(tmp_path / "own" / "episodes.csv", 8)
+    assert [vars(record) for record in trained.episodes] == frame.to_dict("records")
+    assert told == trained.episodes == train(run).episodes  # without a folder, too
+    assert train(run, told.append, tmp_path / "own") and len(told) == 8  # is finished
+    observation = [0.1, 0.0, -0.1, 0.2]
+    logits = [a.policy(observation).logits for a in (trained.agent, load_agent(tmp_path / "own"))]
+    assert logits[0].tolist() == logits[1].tolist()
+    with pytest.raises(ConfigError, match="episodes was 8 and is 9"):
+        train(settings("CartPole-v1", "mace_full", seed=5, episodes=9), folder=tmp_path / "own")
+
+
+def test_the_folder_of_an_id_with_a_namespace(register, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    cart = gymnasium.spec("CartPole-v1").entry_point
+    words = ["train", "--env", register("Own/Cart-v0", cart, None), "--variant", "ppo"]
+    assert call(monkeypatch, *words, "--episodes", "2", "--max-episode-steps", "5") == (0, "")
+    record = json.loads(Path("runs/Own+Cart-v0/ppo/seed0/run.json").read_text())
+    assert record["config"]["environment"] == "Own/Cart-v0"
+
+
+def test_what_is_installed_satisfies_every_extra_but_parquet():
+    """pip check does not look at extras; `make lock` may have been forgotten."""
+    for line in requires("mace-rl"):
+        requirement = Requirement(line)
+        if requirement.name != "pyarrow":
+            assert requirement.specifier.contains(version(requirement.name)), line
+
+
+def test_the_readme_s_example(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = next(b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "train(" in b)
+    assert len(example.splitlines()) <= 10 and "episodes=200" in example
+    names: dict = {}
+    exec(example.replace("episodes=200", "episodes=4"), names)
+    assert len(names["episodes"]) == 4
