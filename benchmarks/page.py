@@ -17,6 +17,11 @@ HEAD = """# Measurements
 
 Written by `python -m benchmarks` (`make bench`) from [measurements.csv](measurements.csv): change
 neither by hand. [docs/performance.md](../docs/performance.md) explains them.
+
+Rates and ratios are medians over the repeats, with their range in brackets. The line below each
+section's tables names its commit, which can be another one. An environment alone takes random
+actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs. The walks are random walks
+in the shape of Acrobot and Hopper that cost next to nothing.
 """
 RATE = "environment steps per CPU second"
 
