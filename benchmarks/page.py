@@ -134,7 +134,7 @@ def draw_speed(rows: pd.DataFrame) -> plt.Figure:
             by.agg(name).reindex(speed.LABELS) for name in ("median", "min", "max")
         )
         panel.barh(list(speed.LABELS.values()), median, xerr=[median - low, high - median])
-        panel.set(xscale="log", xlim=(1e3, 3e5), title=environment, xlabel=RATE)
+        panel.set(xscale="log", xlim=(1e3, 5e5), title=environment, xlabel=RATE)
         panel.grid(axis="x", alpha=0.3)
     panels[0].invert_yaxis()
     return figure
