@@ -5,22 +5,36 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mace_rl import files
-from mace_rl.runs.provenance import KEYS
+from mace_rl.results.records import rounded, write_episodes
+from mace_rl.runs.provenance import KEYS, file_digest
 from tools import kept_runs
 
 
-def make_run(folder: Path, text: str) -> None:
+def make_run(folder: Path, number: int, episodes: int = 30) -> None:
     folder.mkdir(parents=True)
-    (folder / files.EPISODES).write_text(text)
-    (folder / files.AGENT).write_text(f"agent of {text}")
+    rng = np.random.default_rng(number)
+    length = rng.integers(1, 500, episodes)
+    columns = {
+        "episode": np.arange(1, episodes + 1),
+        "env_steps": np.cumsum(length),
+        "length": length,
+        "extrinsic_return": rng.normal(size=episodes) if number % 2 else -length.astype(float),
+        "intrinsic_return": np.array([rounded(x) for x in rng.exponential(size=episodes)]),
+        "beta": np.array([rounded(x) for x in rng.uniform(size=episodes) ** 20]),
+        "terminated": rng.integers(0, 2, episodes),
+    }
+    write_episodes(folder / files.EPISODES, columns)
+    (folder / files.AGENT).write_text(f"agent of {number}")
     digests = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (files.EPISODES, files.AGENT)
     }
-    record = {key: {} for key in KEYS} | {"outputs": digests}
+    record = {key: {} for key in KEYS} | {"outputs": digests, "config": {"episodes": episodes}}
+    record["seconds"] = 10 * number
     (folder / files.RECORD).write_text(json.dumps(record))
 
 
@@ -29,14 +43,15 @@ def content(folder: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and (path.name != files.AGENT or path.parent.name == "seed0")
+        if path.is_file() and (path.name != files.AGENT or path.parent.name == "seed100")
     }
 
 
 def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     results, kept = tmp_path / "results", tmp_path / "kept"
-    for run in ("A-v1/ppo/seed0", "A-v1/ppo/seed10", "A-v1/ppo/seed9", "B-v0/mace_full/seed3"):
-        make_run(results / "runs" / run, f"records of {run}\n" * 50)
+    runs = "A-v1/ppo/seed100", "A-v1/ppo/seed1000", "A-v1/ppo/seed99", "B-v0/mace_full/seed3"
+    for number, run in enumerate(runs):
+        make_run(results / "runs" / run, number, episodes=20 + 7 * number)
     (results / "runs/A-v1/ppo/seed11").mkdir()  # not finished
     assert kept_runs.pack(results, kept) == 4
     assert sorted(content(kept)) == ["A-v1/ppo.tar.xz", "B-v0/mace_full.tar.xz"]
@@ -47,8 +62,8 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
 
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
     for half in (0, 1):
-        make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", f"{half}\n")
-        make_run(tmp_path / f"whole/runs/A-v1/ppo/seed{half}", f"{half}\n")
+        make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", half)
+        make_run(tmp_path / f"whole/runs/A-v1/ppo/seed{half}", half)
     kept_runs.pack(tmp_path / "half1", tmp_path / "kept")
     assert kept_runs.pack(tmp_path / "half0", tmp_path / "kept") == 2
     kept_runs.pack(tmp_path / "whole", tmp_path / "kept whole")
@@ -56,19 +71,20 @@ def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> N
 
 
 def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_path: Path) -> None:
-    run, kept = tmp_path / "results/runs/A-v1/ppo/seed0", tmp_path / "kept"
-    make_run(run, "1\n")
+    run, kept = tmp_path / "results/runs/A-v1/ppo/seed100", tmp_path / "kept"
+    make_run(run, 1)
     kept_runs.pack(tmp_path / "results", kept)
     before = content(kept)
-    (run / files.EPISODES).write_text("2\n")
+    records = (run / files.EPISODES).read_bytes()
+    (run / files.EPISODES).write_bytes(records.replace(b"0", b"1"))
     with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    (run / files.EPISODES).write_text("1\n")
+    (run / files.EPISODES).write_bytes(records)
     (run / files.AGENT).write_text("another")
     with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     shutil.rmtree(run)
-    make_run(run, "2\n")
+    make_run(run, 2)
     with pytest.raises(ValueError, match=r"ppo\.tar\.xz has another run of this seed"):
         kept_runs.pack(tmp_path / "results", kept)
     assert content(kept) == before
@@ -81,7 +97,7 @@ def test_where_there_are_no_runs_nothing_is_done(
 ) -> None:
     origin, goal = tmp_path / folder, tmp_path / "goal"
     (tmp_path / "without a finished run/runs/A-v1/ppo/seed0").mkdir(parents=True)
-    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", "1\n")
+    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
     kept_runs.pack(tmp_path / "results", goal)  # what is there already does not count
     before = content(tmp_path)
     wanted = {"pack": "runs/ENV/VARIANT/seedN/run.json", "unpack": "ENV/VARIANT.tar.xz"}[command]
@@ -90,3 +106,30 @@ def test_where_there_are_no_runs_nothing_is_done(
         kept_runs.main()
     assert ended.value.code == f"kept_runs: {origin}: no {wanted} in it"
     assert content(tmp_path) == before
+
+
+def test_records_that_columns_cannot_give_back_are_refused(tmp_path: Path) -> None:
+    """Whatever training never wrote: here a number of steps that is not the sum of the lengths."""
+    run = tmp_path / "results/runs/A-v1/ppo/seed1"
+    make_run(run, 1)
+    lines = (run / files.EPISODES).read_text().splitlines(keepends=True)
+    lines[3] = lines[3].replace(",", ",1", 1)
+    (run / files.EPISODES).write_text("".join(lines))
+    record = json.loads((run / files.RECORD).read_text())
+    record["outputs"][files.EPISODES] = file_digest(run / files.EPISODES)
+    (run / files.RECORD).write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"seed1/episodes\.csv is not as a training writes it"):
+        kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+def test_a_sample_is_of_short_runs_of_different_archives(tmp_path: Path) -> None:
+    for number in range(9):  # which take 0 to 80 seconds
+        make_run(tmp_path / f"results/runs/{'AB'[number % 2]}-v0/v{number // 2}/seed100", number)
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    assert kept_runs.unpack_sample(tmp_path / "kept", tmp_path / "sample", 4) == 4
+    found = content(tmp_path / "sample")
+    whole = content(tmp_path / "results")
+    assert found.items() <= whole.items() and len(found) == 2 * 4
+    with pytest.raises(ValueError, match="6 runs in it that take less than 60 s"):
+        kept_runs.unpack_sample(tmp_path / "kept", tmp_path / "more", 7)

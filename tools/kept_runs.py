@@ -2,15 +2,18 @@
 
     .venv/bin/python -m tools.kept_runs pack RESULTS ARCHIVE      results/study reference/study
     .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS    reference/study results/study
+    .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS --sample 3       (make verify)
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
-what is not kept; of seed0 the agent too, which the report shows at play.
-ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE. Packing again adds seeds to those that are there;
-equal runs give equal files. `make tables` reads what is in reference/study.
+what is not kept; of seed100 the agent too, which the report shows at play.
+ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
+and without the columns that the others tell, which takes half the room. Packing again adds seeds to
+those that are there; equal runs give equal files. `make tables` reads what is in reference/study.
 """
 
 import argparse
 import io
+import itertools
 import json
 import lzma
 import os
@@ -18,12 +21,18 @@ import sys
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import get_type_hints
+
+import numpy as np
 
 from mace_rl import files
 from mace_rl.files import write_atomically
+from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.provenance import file_digest, read_record
 
-AT_PLAY = "seed0"
+AT_PLAY = "seed100"
+LONGEST = 60  # seconds of a run in a sample
+COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episode", "env_steps")]
 
 
 def read(archive: Path) -> dict[str, bytes]:
@@ -31,20 +40,54 @@ def read(archive: Path) -> dict[str, bytes]:
     # Decompressed at once: tarfile's own way takes twice as long.
     content = lzma.decompress(archive.read_bytes())
     with tarfile.open(fileobj=io.BytesIO(content)) as tar:
-        files_in_it = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
-        return {name: file.read() for name, file in files_in_it if file is not None}
+        members = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
+        found = {name: file.read() for name, file in members if file is not None}
+    if not found.keys() >= set(COLUMNS):  # of the first study, which has the files as they were
+        return found
+    columns = {name: found.pop(name).decode().splitlines() for name in COLUMNS}
+    seeds = [name for name in found if name.endswith(files.RECORD)]
+    start = 0
+    for name in seeds:
+        end = start + json.loads(found[name])["config"]["episodes"]
+        own = {column: values[start:end] for column, values in columns.items()}
+        found[name.replace(files.RECORD, files.EPISODES)] = _together(own)
+        start = end
+    return found
 
 
 def write(archive: Path, content: dict[str, bytes]) -> None:
-    """Write an archive without times and owners: equal content gives an equal file."""
+    """Write an archive without times and owners: equal content gives an equal file.
+
+    `ValueError` where the episodes could not be put together again.
+    """
+    names = sorted(content, key=lambda name: (int(name[4 : name.index("/")]), name))
+    columns: dict[str, list[str]] = {name: [] for name in COLUMNS}
+    members = {name: content[name] for name in names if not name.endswith(files.EPISODES)}
+    for name in (name for name in names if name.endswith(files.EPISODES)):
+        header, *rows = (line.split(",") for line in content[name].decode().splitlines())
+        own = {column: [row[header.index(column)] for row in rows] for column in COLUMNS}
+        if _together(own) != content[name]:
+            raise ValueError(f"{archive}: {name} is not as a training writes it")
+        for column, values in own.items():
+            columns[column] += values
+    members |= {name: "\n".join(values).encode() for name, values in columns.items()}
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for name in sorted(content, key=lambda name: (int(name[4 : name.index("/")]), name)):
+        for name, data in members.items():
             member = tarfile.TarInfo(name)
-            member.size = len(content[name])
-            tar.addfile(member, io.BytesIO(content[name]))
+            member.size = len(data)
+            tar.addfile(member, io.BytesIO(data))
     archive.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(archive, lzma.compress(buffer.getvalue(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def _together(columns: dict[str, list[str]]) -> bytes:
+    """episodes.csv of one run, from its `COLUMNS`."""
+    steps = itertools.accumulate(map(int, columns["length"]))
+    told = {"episode": map(str, itertools.count(1)), "env_steps": map(str, steps)}
+    cells = [told.get(name) or columns[name] for name in get_type_hints(EpisodeRecord)]
+    lines = map(",".join, zip(*cells, strict=False))  # `episode` has no end
+    return "\n".join([",".join(get_type_hints(EpisodeRecord)), *lines, ""]).encode()
 
 
 def pack(results: Path, archives: Path) -> int:
@@ -100,6 +143,30 @@ def unpack(archives: Path, results: Path) -> int:
         return sum(pool.map(put_back, packed))
 
 
+def unpack_sample(archives: Path, results: Path, count: int) -> int:
+    """The same for one run each of `count` archives, at random but always the same.
+
+    Runs that took longer than `LONGEST` are left out: they are to be repeated.
+    """
+    draws, left = np.random.default_rng(0), count
+    packed = sorted(archives.glob("*/*.tar.xz"))
+    for place in draws.permutation(len(packed)):
+        if not left:
+            break
+        archive, content = packed[place], read(packed[place])
+        run = draws.choice([name for name in content if name.endswith(files.RECORD)])
+        if json.loads(content[run])["seconds"] < LONGEST:
+            folder = results / "runs" / archive.parent.name / archive.name.partition(".tar")[0]
+            folder /= Path(run).parent
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in (run, run.replace(files.RECORD, files.EPISODES)):
+                (folder / Path(name).name).write_bytes(content[name])
+            left -= 1
+    if left:
+        raise ValueError(f"{archives}: {count - left} runs in it that take less than {LONGEST} s")
+    return count
+
+
 def main() -> None:
     """Entry point."""
     commands = {"pack": pack, "unpack": unpack}
@@ -110,9 +177,15 @@ def main() -> None:
     parser.add_argument("command", choices=commands)
     parser.add_argument("origin", type=Path, help="RESULTS to pack, or the ARCHIVE to unpack")
     parser.add_argument("goal", type=Path, help="the ARCHIVE, or RESULTS")
+    parser.add_argument("--sample", type=int, metavar="N", help="unpack only N short runs")
     arguments = parser.parse_args()
     try:
-        count = commands[arguments.command](arguments.origin, arguments.goal)
+        if arguments.sample is None:
+            count = commands[arguments.command](arguments.origin, arguments.goal)
+        elif arguments.command == "pack" or arguments.sample < 1:
+            raise ValueError("--sample is a number of runs to unpack, at least 1")
+        else:
+            count = unpack_sample(arguments.origin, arguments.goal, arguments.sample)
     except (ValueError, OSError, tarfile.TarError, lzma.LZMAError) as error:
         sys.exit(f"kept_runs: {error}")
     print(f"{count} runs in {arguments.goal}")
