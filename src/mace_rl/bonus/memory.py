@@ -30,6 +30,7 @@ class EpisodicMemory:
         self.usage = np.zeros(config.capacity, np.int64)
         self.number = np.arange(-config.capacity, 0)
         self.time = self.written = self.stored = 0
+        self.newest_first = np.empty(0, np.int64)  # the entries, from the last written on
         self.read = np.zeros(config.capacity, np.bool_)  # entries, since the last `write`
         self.neighbours: Neighbours | None = None
 
@@ -59,13 +60,16 @@ class EpisodicMemory:
         self.number[oldest] = self.written + np.arange(1, kept + 1)
         self.written += kept
         self.stored = min(self.stored + kept, self.config.capacity)
+        stays = np.full(self.config.capacity, True)
+        stays[oldest] = False
+        before = self.newest_first
+        self.newest_first = np.concatenate([oldest[::-1], before[stays[before]]])
         self.neighbours = None
 
     def lay_out(self, mean: np.ndarray, std: np.ndarray) -> None:
         """From now on distances are Euclidean between (x - mean) / std; both are [key]."""
         # Of equally near entries the first is read: the last written, so that what came of a state
         # lately is what is remembered of it.
-        self.newest_first = np.argsort(-self.number[: len(self)])
         newest = np.take(self.keys, self.newest_first, axis=0)
         self.neighbours = Neighbours(newest, mean, std)
 
@@ -117,6 +121,7 @@ class EpisodicMemory:
         for name in ARRAYS:
             getattr(self, name)[:] = state[name].numpy()
         self.time, self.written, self.stored = state["time"], state["written"], state["stored"]
+        self.newest_first = np.argsort(-self.number[: len(self)])
         self.neighbours = None
 
 
