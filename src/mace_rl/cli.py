@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
         "carry out one training run; the same command resumes it if interrupted",
         "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
     )
-    add("--env", required=True, help="a Gymnasium id, such as Id, Namespace/Id or module:Namespace/Id")
+    add("--env", required=True, help="a Gymnasium id: [module:][Namespace/]Id")
     add("--variant", required=True, help="one of the config's variant_settings")
     add("--seed", default=0, type=int, help="(default: 0)")
     add("--episodes", type=int, help="instead of the config's budget")
