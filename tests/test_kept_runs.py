@@ -60,6 +60,15 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     assert len([*(tmp_path / "again").rglob(files.AGENT)]) == 1
 
 
+def test_an_agent_that_would_be_most_of_the_archive_is_not_kept(tmp_path: Path) -> None:
+    run = tmp_path / "results/runs/A-v1/ppo/seed100"
+    make_run(run, 1)
+    (run / files.AGENT).write_bytes(bytes(kept_runs.LARGEST + 1))
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    kept_runs.unpack(tmp_path / "kept", tmp_path / "again")
+    assert [path.name for path in (tmp_path / "again").rglob("*.pt")] == []
+
+
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
     for half in (0, 1):
         make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", half)

@@ -5,7 +5,7 @@
     .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS --sample 3       (make verify)
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
-what is not kept; of seed100 the agent too, which the report shows at play.
+what is not kept; of seed100 the agent too, unless it is large, which the report shows at play.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
 and without the columns that the others tell, which takes half the room. Packing again adds seeds to
 those that are there; equal runs give equal files. `make tables` reads what is in reference/study.
@@ -30,7 +30,7 @@ from mace_rl.files import write_atomically
 from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.provenance import file_digest, read_record
 
-AT_PLAY = "seed100"
+AT_PLAY, LARGEST = "seed100", 200_000  # whose agent is kept, if it has no more bytes
 LONGEST = 60  # seconds of a run in a sample
 COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episode", "env_steps")]
 
@@ -110,7 +110,9 @@ def pack(results: Path, archives: Path) -> int:
             before = packed.get(f"{run.name}/{files.RECORD}")
             if before and json.loads(before)["outputs"] != digests:
                 raise ValueError(f"{run}: {archive} has another run of this seed")
-            kept = [files.EPISODES, *([files.AGENT] if run.name == AT_PLAY else [])]
+            kept = [files.EPISODES]
+            if run.name == AT_PLAY and (run / files.AGENT).stat().st_size <= LARGEST:
+                kept.append(files.AGENT)
             for name in kept:
                 if file_digest(run / name) != digests[name]:
                     raise ValueError(f"{run / name}: not the file that run.json describes")
