@@ -30,7 +30,7 @@ from mace_rl.files import write_atomically
 from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.provenance import file_digest, read_record
 
-AT_PLAY, LARGEST = "seed100", 200_000  # whose agent is kept, if it has no more bytes
+AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
 LONGEST = 60  # seconds of a run in a sample
 COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episode", "env_steps")]
 
