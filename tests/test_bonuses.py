@@ -272,11 +272,13 @@ def test_mistake_is_named_in_one_line(tmp_path, bonus, fragment):
 
 def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
     """Of the same kind it changes some keys; of another it leaves nothing of it."""
-    bonuses = (CONFIG.parent / "config" / "bonuses.yaml").read_text()
     file = tmp_path / "over.yaml"
     file.write_text(
-        bonuses.replace("{kind: icm}", "{kind: icm, scale: 2.0}")
-        + "training: {bonus: {kind: icm, hidden_units: 7}}\n"
+        "variants: [ppo, mace_fixed, icm, rnd]\n"
+        "variant_settings:\n"
+        "  icm: {beta: {kind: constant, value: 1.0}, bonus: {kind: icm, scale: 2.0}}\n"
+        "  rnd: {beta: {kind: constant, value: 1.0}, bonus: {kind: rnd}}\n"
+        "training: {bonus: {kind: icm, hidden_units: 7}}\n"
     )
     study = read_study([CONFIG, file])
     bonuses = {v: study.run_config("CartPole-v1", v, 0).bonus for v in study.variants}

@@ -12,6 +12,7 @@ from invented import EPISODES, table_for_claims, table_for_questions
 from mace_rl.config.study import Study, read_study
 from mace_rl.results import claims
 from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, ROBUST, WAYS, asked
+from mace_rl.results.records import RecordError
 
 PAPERS = FAMILIES[:1]
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
@@ -154,6 +155,14 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     # Verdicts are of 95 % intervals, whatever those of the tables have.
     wide = study.metrics.model_copy(update={"confidence": 0.5})
     assert claims.ledger(frame, wide, PAPERS)[0][ROBUST]["parts"][0] == part
+
+
+def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
+    """Or differences without it would pass for all."""
+    frame = table_for_claims(12, PLAIN, noise=0.02)
+    own = (frame["env"] == "CartPole-v1") & (frame["variant"] == "ppo") & (frame["seed"] == 5)
+    with pytest.raises(RecordError, match=r"CartPole-v1, ppo, seed 5: there is no"):
+        claims.ledger(frame[~own], study.metrics, PAPERS)
 
 
 def test_one_seed_has_estimates_but_no_tests(study: Study) -> None:

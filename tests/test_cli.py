@@ -90,7 +90,7 @@ def test_settings_that_do_not_fit_the_environment_get_one_line(name, monkeypatch
     refused(monkeypatch, GOOD | change, expected)
 
 
-@pytest.mark.parametrize("order", [("exploration", "controls"), ("controls", "exploration")])
+@pytest.mark.parametrize("order", [("planted", "questions"), ("questions", "planted")])
 def test_runs_of_combined_studies_are_those_of_the_workflow(order):
     """As Snakemake's own function reads the files over each other."""
     paths = [DEFAULTS.parent / "config" / f"{name}.yaml" for name in order]

@@ -1,19 +1,17 @@
-"""Comparisons, regret and scores from small frames, against scipy, enumeration and loops."""
+"""Comparisons and scores from small frames, against scipy, enumeration and loops."""
 
 from functools import partial
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy.stats
 from invented import SEEDS, expanded, table_for_scores, table_for_tables
 
-from mace_rl.config.results import RegretConfig
 from mace_rl.config.study import Study, read_study
 from mace_rl.results import aggregate as a
-from mace_rl.results.comparisons import comparisons, regret
+from mace_rl.results.comparisons import comparisons
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.statistics import logrank, probability_of_improvement
 
@@ -127,68 +125,6 @@ def test_one_seed_has_a_difference_and_no_p_value():
     assert result[["low", "high", "p_value", "p_holm", "probability_low"]].isna().all(axis=None)
     assert result["probability"].notna().all()
     assert result.loc[result["env"] != "all", "difference"].notna().all()
-
-
-AREAS = {  # by environment: of the meta network and of three constants
-    "CartPole-v1": {"mace_full": 300.0, "ppo": 200.0, "mace_fixed": 350.0, "low": 340.0},
-    "Acrobot-v1": {"mace_full": -120.0, "ppo": -110.0, "mace_fixed": -400.0, "low": -300.0},
-}
-CHOSEN = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed", "low"])
-REGRET = SETTINGS.model_copy(update={"regret": CHOSEN})
-
-
-def regret_of(seeds=8, noise=0.0, draw=1, **areas):
-    """The frame of regret.csv, and that of metrics.csv that it is from."""
-    frame = metrics(list(AREAS), list(AREAS["CartPole-v1"]), seeds)
-    draws = np.random.default_rng(draw)
-    means = [areas.get(row.variant, AREAS[row.env][row.variant]) for row in frame.itertuples()]
-    frame["area_under_curve"] = means + noise * draws.normal(size=len(frame))
-    return regret(frame, REGRET).set_index("env"), frame
-
-
-def test_regret_by_hand():
-    result, _ = regret_of()
-    by_hand = {"CartPole-v1": 50 / (350 - 22.1), "Acrobot-v1": 10 / (-110 + 499.1)}
-    by_hand["all"] = np.mean(list(by_hand.values()))
-    for name, value in by_hand.items():
-        assert result.loc[name, ["regret", "low", "high"]].tolist() == pytest.approx([value] * 3)
-    assert result["best_constant"].tolist() == ["mace_fixed", "ppo", ""]
-    assert result[["best_area", "variant_area"]].to_numpy()[:2].tolist() == [
-        *([350, 300], [-110, -120])
-    ]
-    assert (result["seeds"] == 8).all()
-    constants = dict.fromkeys(("ppo", "mace_fixed", "low"), -600.0)  # none beats random
-    assert regret_of(**constants)[0][["regret", "low", "high"]].isna().all(axis=None)
-    one_seed, _ = regret_of(seeds=1)
-    assert one_seed["regret"].notna().all()
-    assert one_seed[["low", "high"]].isna().all(axis=None)
-
-
-def test_the_interval_of_regret_chooses_the_best_constant_anew():
-    result, frame = regret_of(noise=30)
-    draws, regrets = np.random.default_rng(5), {name: [] for name in AREAS}
-    for name, random in (("CartPole-v1", 22.1), ("Acrobot-v1", -499.1)):
-        runs = frame[frame["env"] == name]
-        wide = runs.pivot(index="seed", columns="variant", values="area_under_curve")
-        for _ in range(2000):
-            means = wide.loc[draws.integers(8, size=8)].mean()
-            best = means.drop("mace_full").max()
-            regrets[name].append((best - means["mace_full"]) / (best - random))
-    regrets["all"] = np.mean(list(regrets.values()), axis=0)
-    for name, drawn in regrets.items():
-        found, expected = result.loc[name, ["low", "high"]].astype(float), expanded(drawn, 8)
-        np.testing.assert_allclose(found, expected, atol=0.12 * np.ptp(expected))
-
-
-def test_environments_are_measured_apart_and_may_have_different_seeds():
-    all_of_it, frame = regret_of(noise=30)
-    fewer = frame[(frame["env"] != "Acrobot-v1") | (frame["seed"] < 5)]
-    found = regret(fewer, REGRET).set_index("env")
-    assert found["seeds"].to_dict() == {"CartPole-v1": 8, "Acrobot-v1": 5, "all": 5}
-    both = found.loc[["CartPole-v1", "Acrobot-v1"], "regret"].mean()
-    assert found.loc["all", "regret"] == pytest.approx(both)
-    alone = regret(frame[frame["env"] == "Acrobot-v1"], REGRET).set_index("env")
-    pd.testing.assert_frame_equal(all_of_it.loc[["Acrobot-v1"]], alone, check_exact=True)
 
 
 def test_aggregate_against_a_loop(study: Study):

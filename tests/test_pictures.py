@@ -9,7 +9,7 @@ import pytest
 from invented import SEEDS, table_for_claims, table_for_questions, table_for_scores
 from matplotlib.figure import Figure
 
-from mace_rl.config.results import FigureConfig, MetricsConfig, RegretConfig
+from mace_rl.config.results import ConstantsConfig, FigureConfig, MetricsConfig
 from mace_rl.config.study import Study, read_study
 from mace_rl.report.panels import svg
 from mace_rl.results.claims import ledger
@@ -45,8 +45,8 @@ def ledgers() -> list[list[dict]]:
 
 @pytest.fixture
 def settings(study: Study) -> MetricsConfig:
-    regret = RegretConfig(variant="mace_full", constants=CONSTANTS)
-    return study.metrics.model_copy(update={"regret": regret, "bootstrap_repetitions": 500})
+    chosen = ConstantsConfig(learned="mace_full", fixed=CONSTANTS)
+    return study.metrics.model_copy(update={"constants": chosen, "bootstrap_repetitions": 500})
 
 
 def test_every_run_is_there_with_its_returns(runs, settings) -> None:
@@ -67,7 +67,7 @@ def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings)
     for (environment, rows), axes in zip(table.groupby("env", sort=False), panels, strict=False):
         assert len(axes.containers) == (rows["role"] != "learned").sum()  # dots with bars
         assert dict(zip(rows["variant"], rows["role"], strict=True)) == {
-            **dict.fromkeys(CONSTANTS, "constant"),
+            **dict.fromkeys(CONSTANTS, "fixed"),
             "mace_full": "learned",
         }
         assert list(rows["variant"][:2]) == CONSTANTS

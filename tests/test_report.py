@@ -17,12 +17,11 @@ import yaml
 from PIL import Image
 
 from mace_rl import files
-from mace_rl.config.results import RegretConfig
+from mace_rl.config.results import ConstantsConfig
 from mace_rl.config.study import read_study
 from mace_rl.report.animations import animations
 from mace_rl.report.page import Making, _costs, duration, short
 from mace_rl.report.page import page as build
-from mace_rl.results.comparisons import regret
 from mace_rl.results.figures import Look
 from mace_rl.results.pages import read_data
 from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
@@ -186,17 +185,17 @@ def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -
 
 
 def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
-    """From the same files, some left out, with a regret; made twice, it is the same."""
+    """From the same files, some left out; made twice, it is the same."""
     study = read_study([made / "config.yaml", made / "tiny.yaml"])
-    chosen = RegretConfig(variant="mace_full", constants=["ppo", "mace_fixed"])
+    chosen = ConstantsConfig(learned="mace_full", fixed=["ppo", "mace_fixed"])
     settings = study.metrics.within(study.environments, study.variants)
-    settings = settings.model_copy(update={"regret": chosen})
+    settings = settings.model_copy(update={"constants": chosen})
     runs = [(*key, study.run_config(*key).episodes) for key in study.runs()]
     data, claims = read_data(
         {path.stem: path for path in (made / "results").glob("*.csv")}, runs, settings
     )
     assert not claims
-    data |= {"figure2": data["figure2"].head(0), "regret": regret(data["metrics"], settings)}
+    data["figure2"] = data["figure2"].head(0)
     records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
     making = Making("a command", {}, ppo, records)
@@ -211,7 +210,6 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     assert f"agent.pt is not there, are the agents of {', '.join(VARIANTS)}" in page.words("agents")
     assert not page.all("agents", "img")
     assert "constants" in [one.get("aria-label") for one in page.all("statistics", "svg")]
-    assert "loses against the best constant" in page.words("statistics")
     assert "β is 0 throughout" in page.words("beta")
 
 

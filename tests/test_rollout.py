@@ -233,7 +233,7 @@ def test_noise_is_drawn_up_to_the_time_limit():
 
 
 REPLAYED = [*CLASSIC, "HopperBulletEnv-v0", "Pendulum-v1", "SparseMountainCar-v0", "DeepSea10-v0"]
-REPLAYED += ["FrozenLake8x8Deterministic-v0", "SparseHopper-v0", "BarrenRegion-v0"]
+REPLAYED += ["FrozenLake8x8Deterministic-v0", "BarrenRegion-v0"]
 
 
 @pytest.mark.parametrize("name", REPLAYED)

@@ -51,7 +51,7 @@ metrics: {convergence_slope: 1.0}  # metrics.convergence_slope, 1.0, less than 1
 metrics: {bootstrap_repetitions: 99}  # metrics.bootstrap_repetitions, 99, 100
 metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-v1, nan, finite
 metrics: {random_return: {CartPole-v1: "22"}}  # metrics.random_return.CartPole-v1, '22', number
-metrics: {regret: {variant: mace_full, constants: []}}  # metrics.regret.constants, [], 1 item
+metrics: {constants: {learned: mace_full, fixed: []}}  # metrics.constants.fixed, [], 1 item
 figure: {columns: 0}  # figure.columns, 0, greater than 0
 figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
@@ -195,14 +195,11 @@ def test_files_are_read_over_one_another(tmp_path: Path) -> None:
 
 
 FILES = sorted(path.name for path in (CONFIG.parent / "config").glob("*.yaml"))
-COMBINED = [[name, "exploration.yaml"] for name in ("controls.yaml", "ablations.yaml")]
-COMBINED += [["exploration.yaml", "controls.yaml", "ablations.yaml", "barren.yaml"]]
-OVERLAYS = [[name] for name in FILES if name != "barren.yaml"]  # that takes others' variants
 
 
-@pytest.mark.parametrize("names", [*OVERLAYS, *COMBINED], ids=" + ".join)
-def test_every_study_of_the_project_can_be_carried_out(names: list[str]) -> None:
-    study = read_study([CONFIG, *(CONFIG.parent / "config" / name for name in names)])
+@pytest.mark.parametrize("name", FILES)
+def test_every_study_of_the_project_can_be_carried_out(name: str) -> None:
+    study = read_study([CONFIG, CONFIG.parent / "config" / name])
     for run in study.runs():
         study.run_config(*run)
     study.metrics.within(study.environments, study.variants)

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
 
 from mace_rl.config.study import Study, read_study
-from mace_rl.environments.tasks import BarrenRegion, DeepSea, MetresPassed, NoisyDeepSea
+from mace_rl.environments.tasks import BarrenRegion, DeepSea, NoisyDeepSea
 
 ROOT = Path(__file__).parents[1]
 NORTH, EAST, SOUTH, WEST = range(4)
@@ -56,10 +56,9 @@ def play(env: gymnasium.Env, actions: Iterable) -> tuple[list, list[float], bool
 
 
 def test_gymnasium_accepts_them(study, recwarn):
-    for name in [*study.environments[2:], "SparseHopper-v0"]:
+    for name in study.environments[2:]:
         check_env(gymnasium.make(name, disable_env_checker=True).unwrapped, skip_render_check=True)
-        # SparseHopper's is about a method `seed`, which Bullet's have.
-        assert name == "SparseHopper-v0" or not [str(warning.message) for warning in recwarn]
+        assert not [str(warning.message) for warning in recwarn]
         recwarn.clear()
 
 
@@ -181,31 +180,6 @@ def test_the_archive_of_the_noisy_deep_sea():
             assert (observations, rewards, terminated) == expected
     assert len(pages) > 500 and max(pages) < 1101
     assert kstest(pages, "uniform", args=(101, 1000)).pvalue > 0.01
-
-
-# --- Hopper -------------------------------------------------------------------------------------
-
-
-class Walker(gymnasium.Env):
-    """Is where the action says, in metres from its start; its own robot."""
-
-    observation_space = action_space = gymnasium.spaces.Box(-10, 10, (1,))
-    robot = property(lambda self: self)
-
-    def reset(self, *, seed=None, options=None):
-        self.body_real_xyz = [0.3, 0, 0]
-        return self.body_real_xyz[:1], {}
-
-    def step(self, action):
-        self.body_real_xyz = [0.3 + action, 0, 0]
-        return self.body_real_xyz[:1], 7.0, False, False, {}
-
-
-def test_metres_are_paid_once():
-    env = MetresPassed(Walker(), distance=0.5)
-    for _ in range(2):
-        rewards = play(env, [0.4, 0.6, 0.1, 0.7, 1.7, -3.0, 1.9, 2.1])[1]
-        assert rewards == [0, 1, 0, 0, 2, 0, 0, 1]
 
 
 # --- Barren region ------------------------------------------------------------------------------

@@ -5,14 +5,16 @@
 
 The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
 the outputs that reference/studies.yaml names, and README.md: tables.md with the pictures that are
-among these. They are compared with those in reference/tables. New ones are kept there, and
-README.md, which only shows the others, is renewed; with --check both are mistakes. With --report
-only the page of one study is made, and not compared.
+among these, and the verdicts of the first study beside those of this one. They are compared with
+those in reference/tables. New ones are kept there, and README.md, which only shows the others, is
+renewed; with --check both are mistakes. With --report only the page of one study is made, and not
+compared.
 """
 
 import argparse
 import gc
 import importlib
+import json
 import multiprocessing.connection
 import os
 import re
@@ -26,11 +28,16 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import snakemake.cli
 import snakemake.script
 from threadpoolctl import threadpool_limits
 
 from mace_rl.config.reading import read_yaml
+from mace_rl.results.pages import Ledger
+from mace_rl.results.protocol import ROBUST
+from mace_rl.results.renderings import markdown
+from mace_rl.results.tables import parts
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,6 +53,7 @@ fork = multiprocessing.get_context("fork")
 
 KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
+FIRST = Path("reference/measured/first_study.json")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
@@ -139,7 +147,30 @@ def write_readme(name: str, outputs: list[str]) -> None:
     text = (MADE / name / TABLES).read_text(encoding="utf-8")
     text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
     text = re.sub("^# .*", f"# {name}", text)
+    if (ledger := MADE / name / "claims.json").exists():
+        first, second = (json.loads(path.read_text(encoding="utf-8")) for path in (FIRST, ledger))
+        text += beside_the_first(first, second["claims"])
     (MADE / name / README).write_text(text, encoding="utf-8")
+
+
+def beside_the_first(first: Ledger, second: Ledger) -> str:
+    """The verdicts and the parts of the second study, robust, beside those that the first has."""
+    verdicts = {claim["claim"]: claim[ROBUST]["verdict"] for claim in first}
+    rows = [
+        [c["claim"], c["statement"], verdicts.get(c["claim"], ""), c[ROBUST]["verdict"]]
+        for c in second
+    ]
+    said = pd.DataFrame(rows, columns=["", "statement", "first", "this"])
+    what = ["", "environment", "metric", "over"]
+    shown = [*what, "n", "difference", "outcome"]
+    frames = [parts(claims, ROBUST, {}).iloc[:, [*range(6), -1]] for claims in (first, second)]
+    before, now = (frame.set_axis(shown, axis=1) for frame in frames)
+    both = now.merge(before, "left", on=what, suffixes=("", " (first)")).fillna("")
+    return (
+        "\n## The first study and this one\n\nBoth by the robust metrics and the same rule. The"
+        " first study's runs, of seeds below 20, are in commit 3c9fd6f. It had no NoisyMountainCar"
+        f" and no NoisyDeepSea10.\n\n{markdown(said)}\n{markdown(both)}"
+    )
 
 
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:

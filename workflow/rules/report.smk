@@ -8,7 +8,7 @@ REPORTED = {
         name: f"{RESULTS}/{name}.csv"
         for name in (
             *("metrics", "table1", "supplement", "comparisons", "aggregate"),
-            *("readings", "figure1", "figure1_seeds", "figure2", "figure2_seeds", *REGRET),
+            *("readings", "figure1", "figure1_seeds", "figure2", "figure2_seeds"),
         )
     },
     "records": RECORDS,

@@ -52,10 +52,8 @@ HAS_PAPERS = paper.has_all(study.environments, study.variants)
 ASKS = bool(protocol.asked(study.environments, study.variants))
 CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"]
 CLAIMS = CLAIMS if ASKS and MEASURED.reference_return else []
-# The regret of a learned β only where the configuration asks for it.
-REGRET = ["regret"] if study.metrics.regret else []
 PICTURES = ["every_seed"]  # and what the configuration has the numbers for
-PICTURES += ["constants"] if MEASURED.regret else []
+PICTURES += ["constants"] if MEASURED.constants else []
 PICTURES += ["solved"] if MEASURED.solved_return else []
 PICTURES += ["forest"] if CLAIMS else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.

@@ -3,7 +3,7 @@
 
 SUPPLEMENT = {
     name: report(f"{RESULTS}/{name}.csv", caption=f"../report/{name}.rst", category="Supplement")
-    for name in ("supplement", "comparisons", "aggregate", *REGRET)
+    for name in ("supplement", "comparisons", "aggregate")
 }
 
 
@@ -39,7 +39,7 @@ rule table2:
         "../scripts/table2.py"
 
 
-TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate", *REGRET]
+TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
 TABULATED += ["readings"] if HAS_PAPERS else []  # seconds of work that only Table 1 is worth
 
 

@@ -75,7 +75,7 @@ onstart:
     planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": plan()}
     os.makedirs(f"{RESULTS}/logs", exist_ok=True)
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
-    for line in study.metrics.incomplete(study.environments):
+    for line in study.metrics.incomplete(study.environments, study.variants):
         logger.info(line)
     if ASKS and not CLAIMS:
         logger.info(

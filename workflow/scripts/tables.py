@@ -1,4 +1,4 @@
-"""Table 1 and its supplement, comparisons, all environments together, and regret if asked for."""
+"""Table 1 and its supplement, comparisons, and all environments together."""
 
 from job import job
 
@@ -7,7 +7,7 @@ with job("tables", snakemake.log[0]):
     from mace_rl.files import write_atomically
     from mace_rl.results import summary
     from mace_rl.results.aggregate import aggregate
-    from mace_rl.results.comparisons import comparisons, regret
+    from mace_rl.results.comparisons import comparisons
     from mace_rl.results.latex import table1_latex
     from mace_rl.results.metrics_table import read_metrics
 
@@ -21,8 +21,6 @@ with job("tables", snakemake.log[0]):
         "comparisons": comparisons(metrics, settings),
         "aggregate": aggregate(metrics, settings),
     }
-    if settings.regret:
-        made["regret"] = regret(metrics, settings)
     for name, table in made.items():
         write_atomically(output[name], table.to_csv(index=False))
     write_atomically(output.table1_tex, table1_latex(made["table1"], params.labels, settings))

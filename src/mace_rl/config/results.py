@@ -1,7 +1,7 @@
 """How runs are measured, and how Figure 1 is laid out."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
@@ -11,11 +11,11 @@ from mace_rl.config.section import ConfigError, Reference, Section
 GOALS = ("reference_return", "solved_return")
 
 
-class RegretConfig(Section):
-    """Whose regret is measured, against the best of which constants."""
+class ConstantsConfig(Section):
+    """Which variants are drawn as return over constant β."""
 
-    variant: str
-    constants: list[str] = Field(min_length=1)  # variants too, such as those with a fixed β
+    learned: str  # the line across
+    fixed: list[str] = Field(min_length=1)  # those whose β stays as it is, in their order
 
 
 class MetricsConfig(Section):
@@ -34,7 +34,7 @@ class MetricsConfig(Section):
     solved_return: dict[str, float] = Field(default={})  # from which on an episode is solved
     # Which variant is compared with which, [variant, baseline], where the study has both.
     comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
-    regret: RegretConfig | None = None  # None: there is no regret.csv
+    constants: ConstantsConfig | None = None  # None: there is no picture of them
     custom: list[Reference] = Field(default=[])  # further ones: mace_rl.results.metrics.Metric
 
     @model_validator(mode="after")
@@ -42,8 +42,8 @@ class MetricsConfig(Section):
         for place, pair in enumerate(self.comparisons):
             if pair[0] == pair[1] or pair in self.comparisons[:place]:
                 raise ValueError(f"comparisons has {pair}: two different variants, each pair once")
-        if self.regret and self.regret.variant in self.regret.constants:
-            raise ValueError(f"regret.constants has the variant itself, {self.regret.variant!r}")
+        if self.constants and self.constants.learned in self.constants.fixed:
+            raise ValueError(f"constants.fixed has the learned one, {self.constants.learned!r}")
         return self
 
     def random_return_in(self, environment: str) -> float:
@@ -60,24 +60,26 @@ class MetricsConfig(Section):
         """The values of `GOALS`, by environment; empty for a study without them."""
         return tuple(getattr(self, key) for key in GOALS)
 
-    def incomplete(self, environments: Sequence[str]) -> list[str]:
-        """A line for each of `GOALS` that `within` leaves out for want of some environments."""
+    def incomplete(self, environments: Sequence[str], variants: Sequence[str]) -> list[str]:
+        """A line for whatever `within` leaves out for want of some environments or variants."""
         lines = []
         for key in GOALS:
             goal = getattr(self, key)
             missing = [name for name in environments if name not in goal]
             if missing and len(missing) < len(environments):
                 lines.append(f"metrics.{key} is left out: it has nothing for {', '.join(missing)}")
+        missing = [name for name in self._constant_variants() if name not in variants]
+        if missing:
+            lines.append(f"metrics.constants is left out: variants lacks {', '.join(missing)}")
         return lines
 
     def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
         """These settings for a study of these environments and variants.
 
-        Of `GOALS`, what not every environment has is left out (see `incomplete`). Raises
-        `ConfigError` for a goal that random actions attain, and for a regret of variants that the
-        study does not have.
+        Of `GOALS`, what not every environment has is left out, and `constants` without one of its
+        variants (see `incomplete`). Raises `ConfigError` for a goal that random actions attain.
         """
-        goals: dict[str, dict[str, float]] = {}
+        left: dict[str, Any] = {}
         for key in GOALS:
             given = {
                 name: value for name, value in getattr(self, key).items() if name in environments
@@ -88,11 +90,13 @@ class MetricsConfig(Section):
                         f"metrics.{key}.{name} is {value!r}, but should be greater than"
                         f" metrics.random_return.{name}, {self.random_return[name]!r}"
                     )
-            goals[key] = given if len(given) == len(environments) else {}
-        for variant in [self.regret.variant, *self.regret.constants] if self.regret else []:
-            if variant not in variants:
-                raise ConfigError(f"metrics.regret has {variant!r}, which is not in variants")
-        return self.model_copy(update=goals)
+            left[key] = given if len(given) == len(environments) else {}
+        if not set(variants).issuperset(self._constant_variants()):
+            left["constants"] = None
+        return self.model_copy(update=left)
+
+    def _constant_variants(self) -> list[str]:
+        return [self.constants.learned, *self.constants.fixed] if self.constants else []
 
     def references(self) -> dict[str, str]:
         """By key, the code from outside this package that takes part, as package.module:Name."""

@@ -6,7 +6,7 @@ Planning the workflow needs the ids, and neither PyBullet nor numba nor torch: c
 from contextlib import suppress
 
 import gymnasium
-from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from gymnasium.envs.registration import EnvSpec
 
 gymnasium.register(
     "SparseMountainCar-v0", "mace_rl.environments.tasks:SparseMountainCar", max_episode_steps=200
@@ -37,15 +37,6 @@ gymnasium.register(
     "CliffWalking200-v0",
     "gymnasium.envs.toy_text.cliffwalking:CliffWalkingEnv",
     max_episode_steps=200,
-)
-gymnasium.register(
-    "SparseHopper-v0",
-    "mace_rl.environments.hopper:FastHopperBulletEnv",
-    max_episode_steps=1000,
-    # Falling forward gets it 0.46 m at best, random actions 0.3 m: the first reward takes a hop.
-    additional_wrappers=(
-        WrapperSpec("MetresPassed", "mace_rl.environments.tasks:MetresPassed", {"distance": 0.5}),
-    ),
 )
 gymnasium.register(
     "BarrenRegion-v0", "mace_rl.environments.tasks:BarrenRegion", max_episode_steps=60

@@ -5,7 +5,6 @@
     DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
     FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
     CliffWalking200-v0              -13; what random actions find is the cliff, at -100 a fall
-    SparseHopper-v0                 1 for every 0.5 m; falling forward does not get that far
     BarrenRegion-v0                 1; novelty without end lies elsewhere
     NoisyMountainCar-v0             1; the same, as a television that an action switches on
     NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
@@ -135,38 +134,6 @@ class NoisyDeepSea(DeepSea):
         self.row += 1
         page = self.cells + int(self.np_random.integers(self.pages))
         return page, -0.001, self.row == self.size, False, {}
-
-
-class MetresPassed(gymnasium.Wrapper):
-    """Reward 1 each time the torso has come another `distance` metres forward, otherwise 0.
-
-    For a locomotion environment of Bullet's. The farthest point of the episode counts, so going
-    back and forth earns nothing. How far it is to the next reward is not in the observation.
-    """
-
-    def __init__(self, env: gymnasium.Env, distance: float) -> None:
-        super().__init__(env)
-        self.distance = distance
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The environment's reset; the way counts from there."""
-        result = self.env.reset(seed=seed, options=options)
-        self.start, self.passed = self._x(), 0
-        return result
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """The environment's step, under another reward."""
-        state, _, terminated, truncated, info = self.env.step(action)
-        before = self.passed
-        self.passed = max(before, int((self._x() - self.start) / self.distance))
-        return state, float(self.passed - before), terminated, truncated, info
-
-    def _x(self) -> float:
-        """Where the torso is on the way forward, in metres."""
-        bare: Any = self.unwrapped
-        return float(bare.robot.body_real_xyz[0])
 
 
 class BarrenRegion(gymnasium.Env):

@@ -120,7 +120,7 @@ def _pictures(
     look = look._replace(layout=FigureConfig(columns=3))
     made_of = {
         "every_seed": data["metrics"],
-        "constants": data["metrics"] if settings.regret else None,
+        "constants": data["metrics"] if settings.constants else None,
         "solved": data["metrics"] if settings.solved_return else None,
         "forest": claims or None,
     }
@@ -138,7 +138,7 @@ def _tables(
     costs = _costs(making.records, data["metrics"], labels)
     data = {name: tables.named(frame, labels) for name, frame in data.items()}
     means = pd.concat([data["table1"], data["supplement"]])
-    shown: dict[str, Any] = {
+    return {
         "table1": tables.table1(data["table1"]),
         "readings": tables.readings(data["readings"], settings),
         "aggregate": tables.aggregate(data["aggregate"]),
@@ -147,9 +147,6 @@ def _tables(
         "costs": costs,
         "ppo": tables.table2(making.ppo),
     }
-    if "regret" in data:
-        shown["regret"] = tables.regret(data["regret"], data["supplement"], settings)
-    return shown
 
 
 def _parts(

@@ -17,6 +17,7 @@ from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.paper import FIXED, FULL, PAPER_METRICS, PAPER_TABLE1, PPO, VARIANTS
 from mace_rl.results.protocol import CORRELATION, Claim, Family, Part
+from mace_rl.results.records import RecordError
 from mace_rl.results.statistics import (
     equivalence,
     holm,
@@ -173,10 +174,16 @@ def _pair(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The metric of both variants, [seeds] each, in the order of seeds; greater is better.
 
-    runs: those of both in one environment. Episodes beyond the shorter budget count as it.
+    runs: those of both in one environment. Episodes beyond the shorter budget count as it. Raises
+    `RecordError` for a seed that one of the two lacks.
     """
     episodes = part.metric in metrics and metrics[part.metric].unit == "episodes"
     wide = runs.pivot(index="seed", columns="variant", values=part.metric).astype(np.float64)
+    lacking = wide.isna().to_numpy()
+    if lacking.any():
+        row, column = np.argwhere(lacking)[0]
+        run = f"{runs['env'].iloc[0]}, {wide.columns[column]}, seed {wide.index[row]}"
+        raise RecordError(f"{run}: there is no {part.metric}")
     if episodes:
         wide = wide.clip(upper=runs["episodes"].min())
     variant = wide[part.variant].to_numpy()

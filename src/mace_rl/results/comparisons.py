@@ -10,11 +10,9 @@ import pandas as pd
 from mace_rl.config.results import MetricsConfig
 from mace_rl.results.metrics import Metric, all_metrics
 from mace_rl.results.statistics import (
-    draws,
     holm,
     logrank,
     paired_comparison,
-    percentiles,
     probability_of_improvement,
 )
 
@@ -40,20 +38,6 @@ class Comparison(NamedTuple):
     probability: float  # that a run of the variant is better than one of the baseline
     probability_low: float  # of its interval
     probability_high: float
-
-
-class Regret(NamedTuple):
-    """A row of regret.csv: what a variant loses against the best constant."""
-
-    env: str
-    variant: str
-    best_constant: str  # by the mean of `area_under_curve` over all seeds
-    best_area: float  # that mean
-    variant_area: float
-    regret: float  # (best - variant) / (best - random return); NaN if no constant beats random
-    low: float  # of its interval; NaN if in a resample no constant beats random
-    high: float
-    seeds: int
 
 
 def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
@@ -135,50 +119,3 @@ def _reached(runs: pd.DataFrame, metrics: Sequence[Metric], budget: int) -> np.n
             never = (values[:, place] > budget) | (runs[metric.flag] == 1)
             values[never, place] = np.inf
     return values
-
-
-def regret(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """The data of regret.csv from the frame of metrics.csv, as `metrics.regret` configures it.
-
-    One `Regret` per environment and, of several, their mean. The interval is the bootstrap over
-    seeds, of all variants together, in which the best constant is chosen anew each time. The best
-    of several noisy means is on average better than the best of the true ones: the regret errs
-    upward, against the variant, and its interval with it.
-    """
-    assert settings.regret is not None  # or nobody asks
-    variant, constants = settings.regret.variant, settings.regret.constants
-    areas, randoms, rows = [], [], []
-    for environment, runs in table.groupby("env", sort=False):
-        wide = runs.pivot(index="seed", columns="variant", values="area_under_curve")
-        areas.append(wide[[variant, *constants]].to_numpy())  # [seeds, 1 + constants]
-        randoms.append(settings.random_return_in(str(environment)))
-        own, *others = areas[-1].mean(axis=0)
-        best = constants[int(np.argmax(others))], max(others), own
-        losses = _regret(areas[-1:], randoms[-1:], settings)
-        rows.append(Regret(*(str(environment), variant, *best, *losses)))
-    if len(rows) > 1:
-        nothing = "", np.nan, np.nan
-        rows.append(Regret(*(ALL, variant, *nothing, *_regret(areas, randoms, settings))))
-    return pd.DataFrame(rows)
-
-
-def _regret(
-    areas: list[np.ndarray], randoms: list[float], settings: MetricsConfig
-) -> tuple[float, float, float, int]:
-    """Mean regret, its interval and the seeds, from [seeds, 1 + constants] of each environment.
-
-    The seeds are those of the environment that has fewest.
-    """
-    generator = np.random.default_rng(settings.bootstrap_seed)
-    fewest = min(len(area) for area in areas)
-    regrets = []  # of each environment: [repetitions + 1], the seeds as they are first
-    for area, random in zip(areas, randoms, strict=True):
-        seeds = len(area)
-        drawn = draws(seeds, settings.bootstrap_repetitions, generator)
-        means = np.vstack([np.ones(seeds), drawn]) @ area / seeds
-        best = means[:, 1:].max(axis=1)
-        regrets.append((best - means[:, 0]) / np.where(best > random, best - random, np.nan))
-    mean, *resampled = np.mean(regrets, axis=0)
-    if fewest == 1:
-        return mean, np.nan, np.nan, fewest
-    return mean, *percentiles(np.array(resampled), settings.confidence, fewest), fewest

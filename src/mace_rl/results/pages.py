@@ -84,7 +84,7 @@ def tables_page(
     """tables.md: a study's pictures (PNG files beside it) and tables.
 
     data: frames by the name of their CSV file: metrics, betas, table1, supplement, comparisons,
-    aggregate and, where the study has them, readings and regret. claims: the records of its ledger.
+    aggregate and, where the study has them, readings. claims: the records of its ledger.
     """
     return "".join(
         [
@@ -149,14 +149,7 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[str]:
 
 
 def _others(data: Data, settings: MetricsConfig) -> Iterator[str]:
-    """Regret, all environments together, readings and β."""
-    if "regret" in data:
-        frame = tables.regret(data["regret"], data["supplement"], settings)
-        note = (
-            "Returns: means of all training. Regret: the difference as a share of what the best"
-            " constant gains over random actions."
-        )
-        yield _section("What is lost against the best constant", note, frame)
+    """All environments together, readings and β."""
     if data["metrics"]["env"].nunique() > 1:
         note = "Scores: 0 is the random policy, 1 the study's best run."
         frame = tables.aggregate(data["aggregate"])

@@ -23,7 +23,7 @@ from mace_rl.results.tables import SOLVED
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
     from matplotlib.figure import Figure
 
-CONSTANT, LEARNED, OTHER = "constant", "learned", "other"
+FIXED_BETA, LEARNED, OTHER = "fixed", "learned", "other"
 METRIC_LABELS = {metric.name: metric.label for metric in METRICS}
 SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β", FROZEN: "frozen LSTM"}
 SHORT |= {WITHOUT_MEMORY: "without memory"}  # others are called what they are
@@ -67,13 +67,13 @@ def draw_every_seed(table: pd.DataFrame, look: Look) -> "Figure":
 def constants(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The mean return of training of every variant, from the frame of metrics.csv.
 
-    Columns: env, variant, role (`CONSTANT` β in their order, `LEARNED`, whose regret is measured,
-    or `OTHER`), mean over seeds, low, high (its interval), seeds.
+    Columns: env, variant, role (`FIXED_BETA` in their order, `LEARNED` or `OTHER`), mean over the
+    seeds, low, high (its interval), seeds.
     """
-    assert settings.regret is not None  # or nobody asks
-    roles = dict.fromkeys(settings.regret.constants, CONSTANT)
+    assert settings.constants is not None  # or nobody asks
+    roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
-    roles[settings.regret.variant] = LEARNED
+    roles[settings.constants.learned] = LEARNED
     areas = {key: own["area_under_curve"] for key, own in runs.groupby(["env", "variant"])}
     rows = []
     for environment in runs["env"].unique():
@@ -90,9 +90,9 @@ def draw_constants(table: pd.DataFrame, look: Look) -> "Figure":
         names = "Constant β", "Mean return of training"
         figure, panels = grid(table["env"].nunique(), look.layout.columns, *names)
         for (environment, own), axes in zip(table.groupby("env", sort=False), panels, strict=True):
-            fixed = own[own["role"] == CONSTANT]
+            fixed = own[own["role"] == FIXED_BETA]
             for place, (_, row) in enumerate(own[own["role"] != LEARNED].iterrows()):
-                constant, name = row["role"] == CONSTANT, row["variant"]
+                constant, name = row["role"] == FIXED_BETA, row["variant"]
                 axes.errorbar(
                     place + 0.5 * (not constant),
                     row["mean"],

@@ -50,7 +50,7 @@ OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is na
 
 def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
     """A study's data with other names of its variants."""
-    columns = table.columns.intersection(["variant", "baseline", "best_constant"])
+    columns = table.columns.intersection(["variant", "baseline"])
     return table.assign(**{column: table[column].replace(dict(names)) for column in columns})
 
 
@@ -153,26 +153,6 @@ def aggregate(table: pd.DataFrame) -> pd.DataFrame:
             "runs": lambda row: _number(row["runs"]),
             "mean": lambda row: _estimate(row, "mean", 3),
             "interquartile mean": lambda row: _estimate(row, "iqm", 3),
-        },
-    )
-
-
-def regret(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """regret.csv, with the digits that the same returns have in `means`, a `summary`."""
-    found = digits_by_metric(means, settings)
-
-    def digits(row: pd.Series) -> int:
-        return found.get((row["env"], "area_under_curve"), 0)
-
-    return _rows(
-        table.fillna({"best_constant": ""}),
-        {
-            "environment": lambda row: row["env"],
-            "best constant": lambda row: row["best_constant"],
-            "its return": lambda row: _number(row["best_area"], digits(row)),
-            table["variant"].iloc[0]: lambda row: _number(row["variant_area"], digits(row)),
-            "regret": lambda row: _estimate(row, "regret", 4, ends=""),
-            "n": lambda row: _number(row["seeds"]),
         },
     )
 
