@@ -35,6 +35,7 @@ OUTCOMES = {
     "reversed": ("#d55e00", "reversed"),
 }
 INK = "#262626"  # as seaborn draws axes
+LINE = 0.75  # the height of a line of words, where a part has 1
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
@@ -197,9 +198,12 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
     hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
     ends = table[["low", "high", "difference", "paper"]].abs()
-    reach = 1.1 * max(1, np.nanmax(ends.to_numpy()))
-    table = table.assign(place=table.groupby("measured").cumcount())
-    count, ways = table["place"].max() + 1, table["measured"].unique()
+    reach = max(1, np.nanmax(ends.to_numpy()))
+    claims = table.groupby("claim", sort=False)[["claim", "statement"]].first()
+    width = 20 if table["measured"].nunique() > 1 else 40  # letters, beside what the parts are
+    said = {name: _wrapped(" ".join(claim), width) for name, claim in claims.T.items()}
+    table, blocks = _placed(table, {name: len(text.splitlines()) for name, text in said.items()})
+    count, ways = max(end for _, end in blocks.values()), table["measured"].unique()
     with style():
         height = 0.2 * count + LEGEND_HEIGHT
         figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
@@ -212,31 +216,54 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
                 )
                 dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(parts["difference"], parts["place"], "o", **dots)
-            axes.plot(own["paper"], own["place"], "d", **hollow)
+            if own["paper"].notna().any():
+                axes.plot(own["paper"], own["place"], "d", **hollow)
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
-            axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
+            axes.set(title=str(how).capitalize(), xlim=(-1.1 * reach, 1.8 * reach), yticks=[])
             axes.set_xlabel(f"Difference in the claim's favour\n(1: {UNIT})")
             for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
-                first, last = claim["place"].min(), claim["place"].max()
+                name = claim["claim"].iloc[0]
+                top, end = blocks[name]
                 (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
                 colour, _ = OUTCOMES[answer]
-                axes.text(reach, first, verdict, color=colour, ha="right", **small)
+                axes.text(1.8 * reach, top + 0.5, verdict, color=colour, ha="right", **small)
                 for panel in (names, axes):
                     grey = "0.9" if shade % 2 else "white"
-                    panel.axhspan(first - 0.5, last + 0.5, color=grey, zorder=0)
+                    panel.axhspan(top, end, color=grey, zorder=0)
                 if how == ways[-1]:
-                    said = " ".join(claim[["claim", "statement"]].iloc[0]).replace(" β", "\u00a0β")
-                    names.text(0, claim["place"].mean(), textwrap.fill(said, 24), **small)
+                    names.text(0, (top + end) / 2, said[name], **small)
                     for place, part in zip(claim["place"], claim["part"], strict=True):
                         names.text(1, place, part, ha="right", **small)
         names.set_axis_off()
         for panel in (names, *panels):
-            panel.set_ylim(count - 0.5, -0.5)
+            panel.set_ylim(count, 0)
         level = f"{100 * CONFIDENCE:g} % interval"
         legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: {UNIT}, the margin.")
     return figure
+
+
+def _wrapped(words: str, width: int) -> str:
+    """Lines of words, of which a name and its number stay together."""
+    return textwrap.fill(words.replace(" β", "\u00a0β").replace(" = ", "\u00a0=\u00a0"), width)
+
+
+def _placed(
+    table: pd.DataFrame, lines: Mapping[str, int]
+) -> tuple[pd.DataFrame, dict[str, tuple[float, float]]]:
+    """The parts with their `place` from the top, and from where to where each claim reaches.
+
+    lines: of text that stand beside a claim, and may need more room than its parts.
+    """
+    end, blocks, placed = 0.0, {}, []
+    for name, claim in table.groupby("claim", sort=False):
+        order = claim.groupby("measured").cumcount()
+        parts = order.max() + 1
+        start, end = end, end + max(parts, LINE * lines[str(name)])
+        blocks[str(name)] = start, end
+        placed.append((start + end - parts + 1) / 2 + order)
+    return table.assign(place=pd.concat(placed)), blocks
 
 
 class Picture(NamedTuple):
