@@ -9,7 +9,7 @@ from gymnasium.wrappers import TransformReward
 from shared import Bonanza, Twin, finish
 
 from mace_rl.agent.advantages import generalised_advantages
-from mace_rl.agent.scale import AdvantageScale, RewardScale
+from mace_rl.agent.scale import RewardScale
 from mace_rl.bonus.curiosity import Curiosity
 
 
@@ -36,6 +36,12 @@ def test_advantages_are_the_weighted_mean_of_k_step_ones(discount, gae_lambda):
     np.testing.assert_allclose(found, expected)
 
 
+def discounted_sums(rewards: np.ndarray, discount: float) -> list[float]:
+    """At each step, by its definition."""
+    steps = range(len(rewards))
+    return [sum(discount ** (t - i) * rewards[i] for i in range(t + 1)) for t in steps]
+
+
 @pytest.mark.parametrize("kind", ["extrinsic", "intrinsic"])
 @pytest.mark.parametrize("gae_lambda", [0.9, 1.0])
 @pytest.mark.parametrize("terminated", [True, False])
@@ -48,8 +54,7 @@ def test_truncation_bootstraps_and_termination_never(
     ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda, **settings)
     rng = np.random.default_rng(2)
     observations, paid = rng.standard_normal((6, 4)).astype(np.float32), 3 * rng.random(5)
-    sums = [sum(0.99 ** (t - i) * paid[i] for i in range(t + 1)) for t in range(5)]
-    rewards = paid / np.std(sums) if scaled else paid
+    rewards = paid / np.std(discounted_sums(paid, 0.99)) if scaled else paid
     values = Twin(ppo.critics[kind])(observations)[:, 0].detach().numpy()
     worth = 0.0 if terminated else values[5]
     assert abs(values[5]) > 0.05
@@ -67,37 +72,20 @@ def test_truncation_bootstraps_and_termination_never(
 # --- Scales -------------------------------------------------------------------------------------
 
 
-def episodes() -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
-    return [0.7 + rng.standard_normal(length) for length in (1, 7, 2, 30, 1, 12)]
-
-
 @pytest.mark.parametrize("smallest", [1e-8, 3.0])
 @pytest.mark.parametrize("discount", [0.0, 0.5, 0.99, 1.0])
 def test_reward_scale_is_the_deviation_of_discounted_sums_or_smallest(discount, smallest):
-    scale, sums = RewardScale(discount, smallest), []
+    scale, sums, rng = RewardScale(discount, smallest), [], np.random.default_rng(0)
     assert scale.value == max(1.0, smallest)  # nothing seen yet
-    for rewards in episodes():
+    for length in (1, 7, 2, 30, 1, 12):
+        rewards = 0.7 + rng.standard_normal(length)
         scale.update(rewards)
-        sums += [
-            sum(discount ** (t - i) * rewards[i] for i in range(t + 1)) for t in range(len(rewards))
-        ]
+        sums += discounted_sums(rewards, discount)
         if len(sums) > 1:
             assert scale.value == pytest.approx(max(np.std(sums), smallest), rel=1e-9)
     constant = RewardScale(0.0, 1e-8)
     constant.update(np.ones(30))
     assert constant.value > 0.1  # rewards that have not varied are not blown up
-
-
-def test_advantage_scale_is_the_root_mean_square_of_all_so_far_or_smallest():
-    scale, seen = AdvantageScale(0.1), []
-    assert scale.value == 0.1
-    for advantages in [*episodes(), np.zeros(10**6)]:
-        scale.update(advantages)
-        seen += advantages.tolist()
-        mean_square = math.sqrt(sum(x * x for x in seen) / len(seen))
-        assert scale.value == pytest.approx(max(mean_square, 0.1))
-    assert scale.value == 0.1
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])

@@ -1,15 +1,13 @@
 """The command `mace-rl`: mistakes are answered in one line before anything is done."""
 
-import argparse
 import json
 import shlex
 
-import gymnasium
 import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from shared import GOOD, call, files
+from shared import GOOD, OUTCOME, RESULTS, Bonanza, call, files
 from snakemake.utils import update_config
 
 from mace_rl import cli
@@ -23,8 +21,6 @@ CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 # What is changed in a good command, and what the message has to name.
 MISTAKES = {
     "unknown environment": ({"--env": "CartPole-v9"}, ["'CartPole-v9'", "'CartPole-v1'"]),
-    "environment with a path": ({"--env": "../CartPole-v1"}, ["'../CartPole-v1'", "letters"]),
-    "environment without a time limit": ({"--env": "CliffWalking-v1"}, ["time limit"]),
     "unknown variant": ({"--variant": "mace_ful"}, ["'mace_ful'", "'mace_full'"]),
     "variant of a further study": ({"--variant": "beta_0.4"}, ["'beta_0.4'", "--config FILE"]),
     "seed beyond 32 bits": ({"--seed": "4294967296"}, ["4294967296"]),
@@ -34,24 +30,11 @@ MISTAKES = {
     "config that is a folder": ({"--config": "/"}, ["/"]),
     "out below a file": ({"--out": f"{__file__}/run"}, ["test_cli.py"]),
 }
-# What an overlay's settings for FrozenLake-v1 make wrong, noticed when the run is to begin.
-MISFITS = {
-    "unknown argument": ("environment_arguments: {slippery: false}", ["FrozenLake-v1", "slippery"]),
-    "argument's value": ("environment_arguments: {map_name: 9x9}", ["FrozenLake-v1", "9x9"]),
-    "network's outputs": (
-        "ppo: {network: {kind: torch, module: 'test_network:headless'}}",
-        ["ppo.network.module", "headless", "(2, 64)", "(2, 4)"],
-    ),
-    "code that is not there": (
-        "ppo: {network: {kind: torch, module: 'shared:nothing'}}",
-        ["ppo.network.module", "'shared:nothing'", "'nothing'"],
-    ),
-}
 # Mistakes in the form of the command, which argparse answers with the usage and its reason.
 MALFORMED = [
     [],
     ["tarin"],
-    ["train", "--var", "ppo"],
+    ["train", "--env", "CartPole-v1", "--var", "ppo", "--episodes", "0"],
     ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
     ["train", *sum(GOOD.items(), ()), "--out", "x", "--config"],
     ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
@@ -82,12 +65,10 @@ def overlay(folder, environment: str, settings: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("name", MISFITS)
-def test_settings_that_do_not_fit_the_environment_get_one_line(name, monkeypatch, tmp_path):
-    settings, expected = MISFITS[name]
-    config = overlay(tmp_path, "FrozenLake-v1", settings)
+def test_what_is_noticed_only_when_the_run_begins_gets_one_line(monkeypatch, tmp_path):
+    config = overlay(tmp_path, "FrozenLake-v1", "environment_arguments: {slippery: false}")
     change = {"--env": "FrozenLake-v1", "--config": config, "--out": str(tmp_path / "run")}
-    refused(monkeypatch, GOOD | change, expected)
+    refused(monkeypatch, GOOD | change, ["FrozenLake-v1", "slippery"])
 
 
 @pytest.mark.parametrize("order", [("planted", "questions"), ("questions", "planted")])
@@ -98,15 +79,10 @@ def test_runs_of_combined_studies_are_those_of_the_workflow(order):
     for path in paths:
         update_config(merged, yaml.safe_load(path.read_text(encoding="utf-8")))
     expected = load_study(merged, "some.yaml").run_config("DeepSea10-v0", "beta_0.4", 0)
-    options = {"--env": "DeepSea10-v0", "--variant": "beta_0.4"}
-    assert config_of(*paths, **options) == expected.model_copy(update={"episodes": 3})
-
-
-def config_of(*paths, **changes: str):
-    """The run that `mace-rl train` is asked for with these files, of which the last wins."""
-    options = sum((GOOD | {"--out": "x"} | changes).items(), ())
-    words = ["--config", str(paths[0]), "--config", *map(str, paths[1:])]
-    return cli.run_config(cli.parser().parse_args(["train", *options, *words]))
+    options = GOOD | {"--env": "DeepSea10-v0", "--variant": "beta_0.4", "--out": "x"}
+    words = ["train", *sum(options.items(), ()), "--config", str(paths[0]), "--config"]
+    found = cli.run_config(cli.parser().parse_args([*words, str(paths[1])]))
+    assert found == expected.model_copy(update={"episodes": 3})
 
 
 @pytest.mark.parametrize("words", MALFORMED, ids=" ".join)
@@ -114,12 +90,6 @@ def test_a_malformed_command_is_refused_with_its_reason(words, monkeypatch, caps
     code, _ = call(monkeypatch, *words)
     assert code == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("mace-rl")
-
-
-def subcommands() -> dict[str, argparse.ArgumentParser]:
-    """The parser of each subcommand."""
-    (action,) = [a for a in cli.parser()._actions if isinstance(a.choices, dict)]
-    return action.choices
 
 
 @pytest.mark.slow
@@ -133,7 +103,8 @@ def test_the_examples_in_the_help_texts_work(monkeypatch, tmp_path, caplog, caps
     plan = tmp_path / "results" / "reduced" / "logs" / "plan.json"  # what the workflow makes
     plan.parent.mkdir(parents=True)
     plan.write_text('{"cores": 2, "runs": []}')
-    for name, parser in {"": cli.parser(), **subcommands()}.items():
+    (action,) = [a for a in cli.parser()._actions if isinstance(a.choices, dict)]
+    for name, parser in {"": cli.parser(), **action.choices}.items():
         word, program, *words = shlex.split(parser.epilog)
         assert (word, program, words[0]) == ("example:", "mace-rl", name or "train")
         assert call(monkeypatch, *words) == (0, ""), words
@@ -180,88 +151,55 @@ def test_anything_in_place_of_a_value_is_accepted_or_refused_in_one_line(path, v
         assert "\n" not in str(error) and str(error).startswith("some.yaml: ")
 
 
-def test_a_run_by_hand_then_again_then_as_another(monkeypatch, tmp_path, caplog):
+def test_a_run_by_hand_then_again_then_as_another_then_damaged(monkeypatch, tmp_path, caplog):
     caplog.set_level("INFO")
     out = tmp_path / "a run with ümlaut"
-    options = sum((GOOD | {"--out": str(out)}).items(), ())
-    assert call(monkeypatch, "train", *options) == (0, "")
-    results = {"agent.pt", "diagnostics.csv", "episodes.csv", "run.json"}
-    assert set(files(out)) == results
-    records = (out / "episodes.csv").read_bytes()
-    assert call(monkeypatch, "train", *options) == (0, "")
-    assert "finished" in caplog.text
-    limited = overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9")
-    for change, difference in {
-        ("--seed", "1"): "config.seed was 0 and is 1",
-        ("--engine", "torch"): "config.engine was 'compiled' and is 'torch'",
-        ("--config", limited): "config.max_episode_steps was None and is 9",
-    }.items():
-        code, message = call(monkeypatch, "train", *options, *change)
-        assert code == 1 and difference in message
-    assert (out / "episodes.csv").read_bytes() == records
-
-
-OTHERS = {  # what is changed in run.json, and what the message has to name
-    "sources": ("", "a finished run of other code, in mace_rl"),
-    "versions": ({"numpy": "1.0"}, "a finished run where versions.numpy was '1.0' and is '"),
-}
-
-
-def test_results_that_are_damaged_or_of_other_code_are_not_this_run(monkeypatch, tmp_path, caplog):
-    caplog.set_level("INFO")
-    words = ["train", *sum((GOOD | {"--out": str(tmp_path)}).items(), ())]
+    options = GOOD | {"--out": str(out)}
+    words = ["train", *sum(options.items(), ())]
     assert call(monkeypatch, *words) == (0, "")
-    whole = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert files(out) == RESULTS
+    whole = {path.name: path.read_bytes() for path in out.iterdir()}
     caplog.clear()
+    named = [str(out), "choose another folder, or remove this one"]
+    for option, value, difference in (
+        ("--seed", "1", "config.seed was 0 and is 1"),
+        ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),
+        (
+            "--config",
+            overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9"),
+            "config.max_episode_steps was None and is 9",
+        ),
+    ):
+        refused(monkeypatch, options | {option: value}, [*named, difference])
 
-    def refused(name: str, content: bytes | None, *expected: str) -> None:
-        (tmp_path / name).unlink()
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        code, message = call(monkeypatch, *words)
-        (tmp_path / name).write_bytes(whole[name])
-        assert code == 1 and "\n" not in message and str(tmp_path) in message
-        for fragment in (*expected, "choose another folder, or remove this one"):
-            assert fragment in message
+    def damaged(name: str, content: bytes, *expected: str) -> None:
+        (out / name).write_bytes(content)
+        refused(monkeypatch, options, [*named, *expected])
+        (out / name).write_bytes(whole[name])
 
-    for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):
-        refused(name, whole[name][:-1], name, "cut off")
-        refused(name, None, name, "missing")
+    for name in OUTCOME:
+        damaged(name, whole[name][:-1], name, "cut off")
+        (out / name).unlink()
+        refused(monkeypatch, options, [*named, name, "missing"])
+        (out / name).write_bytes(whole[name])
     record = json.loads(whole["run.json"])
-    for key, (other, expected) in OTHERS.items():
-        changed = record[key] | other if isinstance(other, dict) else other
-        refused("run.json", json.dumps(record | {key: changed}).encode(), expected)
+    changed = record | {"sources": ""}
+    damaged("run.json", json.dumps(changed).encode(), "a finished run of other code, in mace_rl")
+    changed = record | {"versions": record["versions"] | {"numpy": "1.0"}}
+    expected = "a finished run where versions.numpy was '1.0' and is '"
+    damaged("run.json", json.dumps(changed).encode(), expected)
     assert not caplog.text  # neither trained nor called finished
     assert call(monkeypatch, *words) == (0, "") and "finished" in caplog.text
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == whole
-
-
-class Breaks(gymnasium.Wrapper):
-    """CartPole whose seventh step raises, in the second episode."""
-
-    def __init__(self) -> None:
-        super().__init__(gymnasium.make("CartPole-v1").unwrapped)
-        self.resets = self.steps = 0
-
-    def reset(self, **options):
-        self.resets, self.steps = self.resets + 1, 0  # one more than there are episodes
-        return self.env.reset(**options)
-
-    def step(self, action):
-        self.steps += 1
-        observation, reward, *_, info = self.env.step(action)
-        if (self.resets, self.steps) == (3, 7):
-            raise ZeroDivisionError("a mistake of its own")
-        return observation, reward, False, self.steps == 8, info
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
 
 
 def test_an_exception_of_an_environment_says_when_it_was(register, run_config, tmp_path):
-    config = run_config(register("Breaks-v0", Breaks), "ppo", 3, episodes=4)
-    with pytest.raises(ZeroDivisionError, match="a mistake of its own") as caught:
-        run.run(config, tmp_path)
+    name = register("Bonanza-v0", Bonanza, 5, where="reward", value="text")  # 1 + "text"
+    with pytest.raises(TypeError) as caught:
+        run.run(run_config(name, "ppo", 3, episodes=9), tmp_path)
     assert caught.value.__notes__ == [
-        "in step 7 of an episode of Breaks-v0",
-        "in Breaks-v0 ppo seed 3, episode 2",
+        "in step 3 of an episode of Bonanza-v0",
+        "in Bonanza-v0 ppo seed 3, episode 4",
     ]
 
 

@@ -3,28 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from shared import environment_of, finish
+from shared import finish
 
-from mace_rl import factories
-from mace_rl.agent.ppo import PPO, Batch
+from mace_rl.agent.ppo import Batch
 from mace_rl.config.section import ConfigError
 from mace_rl.runs.agent import Agent, load_agent
-from mace_rl.streams import Streams
 from mace_rl.trainer import Trainer
 
 DICTIONARY = {"kind": "dictionary", "capacity": 2000, "neighbours": 10}
 DICTIONARY |= {"kernel_bandwidth": 0.05, "learning_rate": 0.1}
-
-
-@pytest.fixture
-def make_ppo(run_config):
-    """`make_ppo(critic, **settings of ppo)`: CartPole's, with both critics."""
-
-    def make(critic=DICTIONARY, **settings) -> PPO:
-        config = run_config("CartPole-v1", "ppo", 0, ppo={"critic": critic} | settings)
-        return factories.ppo(config, environment_of("CartPole-v1"), True, Streams(0))
-
-    return make
 
 
 def batch_of(observations: np.ndarray, returns: np.ndarray) -> Batch:
@@ -84,9 +71,10 @@ class Slow:
 @pytest.mark.parametrize("capacity", [12, 50])
 def test_values_equal_a_search_entry_by_entry(make_ppo, monkeypatch, capacity, normalise):
     """States that come again, capacity that does not last, a standardisation that moves."""
-    settings = {"capacity": capacity, "neighbours": 4, "kernel_bandwidth": 0.1}
-    settings["learning_rate"] = 0.3
-    ppo = make_ppo(DICTIONARY | settings, normalise_observations=normalise)
+    settings = {"capacity": capacity, "neighbours": 4}
+    settings |= {"kernel_bandwidth": 0.1, "learning_rate": 0.3}
+    critic = DICTIONARY | settings
+    ppo = make_ppo(intrinsic=True, critic=critic, normalise_observations=normalise)
     critic, slow = ppo.critics["intrinsic"], Slow(**settings, normaliser=ppo.normaliser)
     rng = np.random.default_rng(0)
     pool = (rng.standard_normal((30, 4)) * [1, 5, 0.1, 3] + [0, 100, 0, 2]).astype(np.float32)
@@ -105,7 +93,7 @@ def test_values_equal_a_search_entry_by_entry(make_ppo, monkeypatch, capacity, n
 
 def test_of_more_new_states_than_fit_the_last_are_kept(make_ppo):
     settings = {"capacity": 3, "neighbours": 1, "kernel_bandwidth": 0.001}
-    critic = make_ppo(DICTIONARY | settings).critics["extrinsic"]
+    critic = make_ppo(critic=DICTIONARY | settings).critics["extrinsic"]
     states = np.eye(5, 4, dtype=np.float32)[[4, 2, 0, 3, 1]]
     critic.remember(batch_of(states, [1, 2, 3, 4, 5]))
     assert (critic.values(states[2:]) == [3, 4, 5]).all() and len(critic) == 3
@@ -113,7 +101,8 @@ def test_of_more_new_states_than_fit_the_last_are_kept(make_ppo):
 
 def test_the_actor_learns_as_with_networks(make_ppo):
     batch = batch_of(np.random.default_rng(0).standard_normal((50, 4)), np.ones(50))
-    ppos = [make_ppo(c, minibatch_size=16) for c in (DICTIONARY, {"kind": "network"})]
+    kinds = DICTIONARY, {"kind": "network"}
+    ppos = [make_ppo(intrinsic=True, critic=kind, minibatch_size=16) for kind in kinds]
     norms = [ppo.update(batch).gradient_norms for ppo in ppos]
     assert (ppos[0].policy.parameters == ppos[1].policy.parameters).all()
     assert norms[0] == {"actor": norms[1]["actor"], "extrinsic": 0.0, "intrinsic": 0.0}

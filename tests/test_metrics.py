@@ -61,16 +61,14 @@ CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.convergence_steps, PEAK, SMALL, 8, False),  # 75 % of the final 9 is reached at t = 6
     (m.convergence_steps, PEAK, SMALL | {"convergence_slope": 0.6}, 7, False),  # 2.25 ≤ 0.6 · 4
     (m.convergence_steps, np.arange(300), {"random": 0}, 300, True),
-    (m.convergence_steps_steepest, PEAK, SMALL, 8, False),
+    (m.convergence_steps_steepest, [0, 0, 1, 1, 1, 1, 2, 2, 2, 2], SMALL, 6, False),  # the first
     (m.convergence_steps_steepest, COLLAPSE, {}, 750, False),  # moved by a late collapse
     (m.convergence_steps_steepest, np.full(300, 0.1), {}, 300, True),
     (m.convergence_steps_steepest, np.arange(300)[::-1], {}, 300, True),
     (m.convergence_steps_steepest, np.arange(99), {}, 99, True),  # two windows short
-    (m.convergence_steps_flattest, PEAK, SMALL, 8, False),
     (m.convergence_steps_flattest, np.ones(99), {}, 99, True),
     (m.convergence_steps_flattest, np.ones(100), {}, 100, False),
     (m.convergence_steps_public_code, np.ones(2000), {}, 586, False),  # its floor
-    (m.convergence_steps_public_code, np.ones(6000), {}, 1786, False),
     (m.convergence_steps_public_code, np.arange(2000), {}, 2000, True),
     (m.convergence_steps_public_code, 0.049 * np.arange(2000), {}, 586, False),
     (m.convergence_steps_public_code, np.ones(60), {}, 60, True),
@@ -102,10 +100,8 @@ def test_every_reading_against_loops(seed):
     slopes = {
         t: round(average[t] - average[t - window], 9) for t in average if t - window in average
     }
-    run, bar = (
-        curve(returns, random=random, moving_average=window),
-        random + 0.75 * (final - random),
-    )
+    run = curve(returns, random=random, moving_average=window)
+    bar, fifty = random + 0.75 * (final - random), [*averages(returns, 50).values()]
 
     def first(episodes):
         found = next(iter(episodes), None)
@@ -124,20 +120,11 @@ def test_every_reading_against_loops(seed):
             if any(average[u] >= bar for u in average if u <= t)
             and slopes[t] <= 0.1 * max(slopes[u] for u in slopes if u <= t)
         ),
+        m.convergence_steps_public_code: first(
+            i + 1 for i in range(105, 301) if abs(fifty[i + 50] - fifty[i]) / 50 < 0.05
+        ),
     }
     assert {metric: metric(run) for metric in expected} == expected
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_public_code_against_a_loop(seed):
-    returns = noisy(seed, 1000) * (1 + seed % 3)
-    average = np.convolve(returns, np.ones(50) / 50, "valid")
-    expected = (1000, True)
-    for i in range(int(0.3 * len(average)), len(average) - 50):
-        if abs(average[i + 50] - average[i]) / 50 < 0.05:
-            expected = (i + 1, False)
-            break
-    assert m.convergence_steps_public_code(curve(returns)) == expected
 
 
 @pytest.mark.parametrize("fraction", ["0.1", "0.07"])
@@ -170,12 +157,6 @@ def test_better_than_random_is_more_than_two_standard_errors():
     returns = [0] * 180 + [2, 0] * 10  # the last 20: mean 1, error 1 / √20
     assert curve(returns, random=1 - 2.01 / np.sqrt(20)).learned
     assert not curve(returns, random=1 - 1.99 / np.sqrt(20)).learned
-    # Of runs that act at random half end above it, and nearly all are censored.
-    draws = np.random.default_rng(0).gamma(4, 22.1 / 4, size=(1000, 500))
-    ends = [m.final_return(returns, 0.1) for returns in draws]
-    assert np.mean(np.array(ends) > 22.1) == pytest.approx(0.5, abs=0.05)
-    runs = [m.sample_efficiency(curve(returns, random=22.1)) for returns in draws]
-    assert np.mean([run.censored for run in runs]) > 0.96
 
 
 def test_moving_averages_of_equal_windows_are_equal_to_the_bit():

@@ -8,19 +8,11 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 import torch
-from numba import njit
-from scipy import special
 from shared import LAYER_NORM, laid_out, layer_norm
 
 from mace_rl.agent import kernels
 from mace_rl.agent.network import CompiledMLP, TorchNetwork, mlp, network
-from mace_rl.beta.lstm import (
-    CompiledMetaNetwork,
-    MetaNetwork,
-    TorchMetaNetwork,
-    meta_network,
-    sigmoid,
-)
+from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork, TorchMetaNetwork, meta_network
 from mace_rl.bonus.density import CompiledAutoencoder, DensityEstimator, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 
@@ -180,32 +172,6 @@ def test_meta_network_is_pytorch_s_lstm_with_a_readout(length):
     _, (hidden, _) = lstm(sequence)
     expected = (hidden[0] * module.readout).sum() + module.readout_bias
     torch.testing.assert_close(module(sequence), expected)
-
-
-# --- Compiled functions -------------------------------------------------------------------------
-
-
-@njit(error_model="numpy")
-def over(function, values):
-    """A compiled function of every value, in a loop that becomes vector operations."""
-    result = np.empty_like(values)
-    for i in range(len(values)):
-        result[i] = function(values[i])
-    return result
-
-
-def test_compiled_tanh_and_sigmoid():
-    values = np.concatenate([np.linspace(-12, 12, 10_001), [0.0, 1e-30, 1e30, np.inf, -np.inf]])
-    values = values.astype(np.float32)
-    exact = np.tanh(values.astype(np.float64))
-    found = over(kernels.tanh, values)
-    assert np.abs(found - exact).max() < 2e-7
-    small = np.abs(values) < 1
-    np.testing.assert_allclose(found[small], exact[small], rtol=4e-7)
-    logistic = special.expit(values.astype(np.float64))
-    assert np.abs(over(sigmoid, values) - logistic).max() < 2e-7
-    for function in (kernels.tanh, sigmoid):  # or a run that goes bad is not noticed
-        assert np.isnan(over(function, np.full(17, np.nan, np.float32))).all()
 
 
 def test_a_permutation_is_uniform_if_the_draws_are():

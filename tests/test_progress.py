@@ -58,6 +58,8 @@ DONE = {"seconds": 130.0, "start_seconds": 30.0}
 
 
 def test_the_table(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no workflow has begun here"):
+        status(tmp_path)
     folder = Folder(tmp_path, cores=2)
     folder.add(record=DONE, due=False, old=("record",))  # by an earlier workflow
     folder.add(record=DONE)
@@ -73,11 +75,6 @@ def test_the_table(tmp_path: Path) -> None:
         "A ppo 3 starting",
         "A ppo 4 90/100 21.5 0.25 1830 stopped",
     ]
-
-
-def test_a_folder_without_a_workflow(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no workflow has begun here"):
-        status(tmp_path)
 
 
 # Runs (environment, work, what there is of it), cores, and the seconds to the end of all.

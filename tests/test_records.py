@@ -59,13 +59,11 @@ DAMAGE = {  # what the file holds, and what the message must name
     "a short row": (text([ROWS[0], "2,30,20,-19.0,0.5,0.3996", ROWS[2]]), "line 3", "6 cells"),
     "a blank line": (text([*ROWS, ""]), "line 5", "1 cells"),
     "a gap": (text([ROWS[0], "3,30,20,-19.0,0.0,0.4,0"]), "line 3", "episode is 3"),
-    "fewer episodes": (text(ROWS[:2]), "line 3", "2 episodes"),
     "more episodes": (text([*ROWS, "4,32,1,0.1,0.0,0.0,1"]), "line 5", "4 episodes"),
     "text": (text([ROWS[0].replace("9.5", "many")]), "line 2", "extrinsic_return is 'many'"),
     "an empty cell": (text([ROWS[0].replace("9.5", "")]), "line 2", "extrinsic_return is ''"),
     "NaN": (text([ROWS[0].replace("9.5", "nan")]), "line 2", "extrinsic_return is 'nan'"),
     "a digit too many": (text([ROWS[0].replace("9.5", "9.50")]), "line 2", "'9.50'"),
-    "a space": (text([ROWS[0].replace("9.5", " 9.5")]), "line 2", "' 9.5'"),
     "an enormous integer": (text(["1," + "9" * 30 + ",10,9.5,0.25,0.4,1"]), "line 2", "env_steps"),
     "env_steps": (text([ROWS[0], ROWS[1].replace("30", "31")]), "line 3", "env_steps is 31"),
     "length": (text(["1,0,0,9.5,0.25,0.4,1"]), "line 2", "length is 0"),
@@ -125,16 +123,11 @@ def test_missing_files_folders_and_other_encodings_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "named"),
-    [
-        ("extrinsic_return", [1.0, np.nan, 1.0], "line 3: extrinsic_return is nan"),
-        ("intrinsic_return", [1.0, 1.0, np.inf], "line 4: intrinsic_return is inf"),
-        ("beta", [0.5, 0.5, 2.0], "line 4: beta is 2.0"),
-    ],
+    ("name", "value"), [("extrinsic_return", np.nan), ("intrinsic_return", np.inf)]
 )
-def test_what_would_be_refused_is_not_written(name, value, named, tmp_path):
-    with pytest.raises(RecordError, match=named):
-        write_episodes(tmp_path / "episodes.csv", columns() | {name: np.array(value)})
+def test_what_would_be_refused_is_not_written(name, value, tmp_path):
+    with pytest.raises(RecordError, match=f"line 3: {name} is {value}"):
+        write_episodes(tmp_path / "e.csv", columns() | {name: np.array([1.0, value, 1.0])})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -145,12 +138,8 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     def fail(descriptor):
         raise OSError("disk full")
 
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fail)
-        with pytest.raises(OSError, match="disk full"):
-            write_episodes(path, columns())
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_episodes(path, columns())
     assert path.read_text() == "before"
-    assert list(tmp_path.iterdir()) == [path]
-    write_episodes(path, columns())
-    assert len(read_episodes(path, 3)) == 3
     assert list(tmp_path.iterdir()) == [path]

@@ -39,8 +39,9 @@ def test_below_ten_seeds_the_interval_is_students_and_then_the_expanded_bootstra
     np.testing.assert_allclose(interval(FIVE), expected, rtol=1e-12)
     # By hand: 0 and 2 have mean 1, standard error 1 and t of one degree of freedom 12.706.
     np.testing.assert_allclose(interval(np.array([0.0, 2.0])), (1 - 12.7062, 1 + 12.7062), 1e-4)
-    resampled = generator(1).choice(TWELVE, (REPETITIONS, 12)).mean(axis=1)
-    np.testing.assert_allclose(interval(TWELVE), expanded(resampled, 12), atol=0.1)
+    resampled = generator(1).choice(TWELVE, (10**5, 12)).mean(axis=1)
+    found = s.mean_interval(TWELVE, 0.95, 10**5, generator())
+    np.testing.assert_allclose(found, expanded(resampled, 12), atol=0.03)
 
 
 @pytest.mark.parametrize("seeds", [5, 12])
@@ -51,16 +52,6 @@ def test_curves_are_treated_point_by_point(seeds, monkeypatch):
     assert low.shape == high.shape == (50,)
     for point in (0, 6, 7, 49):
         np.testing.assert_allclose((low[point], high[point]), interval(values[:, point]))
-
-
-@pytest.mark.parametrize("seeds", [5, 15])
-def test_intervals_cover_the_true_mean_about_as_often_as_they_say(seeds):
-    draws = generator(4)
-    hits = 0
-    for _ in range(300):
-        low, high = s.mean_interval(draws.normal(size=seeds), 0.9, 500, draws)
-        hits += bool(low <= 0 <= high)
-    assert 0.82 <= hits / 300 <= 0.95
 
 
 def test_one_seed_allows_no_interval_and_equal_seeds_one_of_no_width():
