@@ -97,6 +97,7 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
     [
         ("HopperBulletEnv-v0", {}, "numpy .* adds numbers in another order"),
         ("CartPole-v1", {"environment_arguments": {"sutton_barto_reward": True}}, "steps are not"),
+        ("CartPole-v1", {}, None),
         ("Acrobot-v1", {"engine": "torch"}, None),
         ("MountainCar-v0", {}, None),
     ],
