@@ -72,9 +72,7 @@ def reset_both(ours: HopperBulletEnv, theirs: HopperBulletEnv, seed: int | None)
     return state
 
 
-def step_both(
-    ours: HopperBulletEnv, theirs: HopperBulletEnv, action: object
-) -> tuple[np.ndarray, bool]:
+def step_both(ours: HopperBulletEnv, theirs: HopperBulletEnv, action) -> tuple[np.ndarray, bool]:
     state, *rest = ours.step(action)
     expected, *expected_rest = theirs.step(action)
     assert (state.tobytes(), state.dtype) == (expected.tobytes(), np.float32), (state, expected)
@@ -115,13 +113,11 @@ def pair():
 @pytest.mark.parametrize(
     ("policy", "steps", "longest"),
     [
-        (uniform(1.0), 3_000, 15),
-        (uniform(3.0), 2_000, 15),
+        (uniform(2.0), 4_000, 15),
         (uniform(2.0, np.float64), 1_000, 15),
         (hopping, 3_000, 250),
         (pushing, 2_000, 15),
     ],
-    ids=["uniform", "out of range", "float64", "hopping", "pushing"],
 )
 def test_same_bits(pair, policy: Policy, steps: int, longest: int) -> None:
     lengths = run_both(*pair, policy, steps, seed=0)
@@ -138,9 +134,8 @@ def test_same_bits_away_from_the_plane(pair) -> None:
         turn = pybullet.getQuaternionFromEuler(rng.uniform(-0.3, 0.3, 3))
         shift = rng.uniform(-3, 3, 3)
         for env in pair:
-            pybullet.resetBasePositionAndOrientation(
-                env.robot.objects[0], shift, turn, physicsClientId=env.physicsClientId
-            )
+            body, client = env.robot.objects[0], env.physicsClientId
+            pybullet.resetBasePositionAndOrientation(body, shift, turn, client)
         for _ in range(30):
             step_both(*pair, rng.uniform(-1, 1, 3).astype(np.float32))
         assert pair[0].robot.body_xyz[1] != 0 != pair[0].robot.body_rpy[2]
@@ -171,10 +166,8 @@ def test_same_bits_when_the_simulator_blows_up(pair, speed: float) -> None:
     run_both(*pair, uniform(1.0), 50, seed=5)
     for env in pair:
         env.robot.alive_bonus = lambda z, pitch: 1  # so that only a NaN can end the episode
-        reset_joint = env.ordered_joints[1].jointIndex
-        pybullet.resetJointState(
-            env.robot.objects[0], reset_joint, -0.1, speed, physicsClientId=env.physicsClientId
-        )
+        body, joint = env.robot.objects[0], env.ordered_joints[1].jointIndex
+        pybullet.resetJointState(body, joint, -0.1, speed, env.physicsClientId)
     ours, theirs = (env.step(np.zeros(3, np.float32)) for env in pair)
     np.testing.assert_array_equal(ours[0], theirs[0])  # a NaN's sign is the processor's affair
     np.testing.assert_array_equal(ours[1], theirs[1])

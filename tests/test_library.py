@@ -62,6 +62,7 @@ def test_each_name_is_what_its_module_has_and_no_other_is_there():
 
 
 def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
+    assert DEFAULTS == ROOT / "config.yaml"  # not a copy, which edits would not reach
     file = tmp_path / "own.yaml"
     file.write_text("variant_settings: {low: {beta: {kind: constant, value: 0.1}}}")
     changes = {"episodes": 7, "ppo": {"clip": 0.1}}
@@ -70,11 +71,6 @@ def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     beta = {"kind": "constant", "value": 0.1}
     assert found.settings() == expected | {"variant": "low", "beta": beta}
     assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
-
-
-def test_the_package_s_defaults_are_config_yaml_itself():
-    """Not a copy: what one edits there is what a run by hand gets."""
-    assert DEFAULTS == ROOT / "config.yaml"
 
 
 MISTAKES = {

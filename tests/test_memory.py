@@ -33,43 +33,25 @@ def experiences(count, seed=0, key_size=3) -> list[np.ndarray]:
 @pytest.mark.parametrize(("size", "total"), [(1, 30), (4, 500), (15, 2000)])
 @pytest.mark.parametrize("centre", [0, 1000])
 def test_nearest_equals_a_full_sort(size, total, centre):
-    """Also far from the origin, at positions like 1000 ± 0.01: the mean goes before the scale."""
+    """Also far from the origin, at positions like 1000 ± 0.01: the mean goes before the scale.
+
+    A query that is NaN is at no distance from anything, and disturbs no other.
+    """
     rng = np.random.default_rng(0)
     spread = np.array([0.01, 2, 1] * 5)[:size]
     points, queries = (
         (centre + spread * rng.standard_normal((count, size))).astype(np.float32)
         for count in (total, 25)
     )
+    queries = np.append(queries, queries[:1] * np.float32(np.nan), axis=0)
     mean, std = points.mean(0, dtype=np.float64), points.std(0, dtype=np.float64)
     squares, indices = Neighbours(points, mean, std).nearest(queries, 20)
-    exact = (((queries[:, None].astype(np.float64) - points[None]) / std) ** 2).sum(2)
+    assert np.isnan(squares[25]).all() and ((indices >= 0) & (indices < total)).all()
+    exact = (((queries[:25, None].astype(np.float64) - points[None]) / std) ** 2).sum(2)
     expected = np.sort(exact, axis=1)[:, :20]
-    np.testing.assert_allclose(squares, expected, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(np.take_along_axis(exact, indices, 1), expected, rtol=1e-4)
+    np.testing.assert_allclose(squares[:25], expected, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(np.take_along_axis(exact, indices[:25], 1), expected, rtol=1e-4)
     assert all(len(set(row)) == 20 for row in indices.tolist())
-
-
-@settings(max_examples=200, deadline=None, derandomize=True)
-@given(st.data())
-def test_nearest_equals_a_stable_sort_whatever_the_order_and_the_ties(data):
-    """To the bit: differences of small integers are exact. Sorted points come nearest last."""
-    size, total = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 200))
-    count = data.draw(st.integers(1, total))
-    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
-    points = rng.integers(-3, 4, (total, size)).astype(np.float32)
-    if data.draw(st.booleans()):
-        points = np.sort(points, axis=0)
-    queries = rng.integers(-3, 4, (4, size)).astype(np.float32)
-    laid_out = Neighbours(points, np.zeros(size), np.ones(size))
-    squares, indices = laid_out.nearest(queries, count)
-    exact = np.square(queries[:, None] - points).sum(2)
-    expected = np.argsort(exact, axis=1, kind="stable")[:, :count]
-    assert (indices == expected).all()
-    assert (squares == np.take_along_axis(exact, expected, 1)).all()
-    queries[1] = np.nan  # at no distance from anything, and the others are found all the same
-    squares, again = laid_out.nearest(queries, count)
-    assert np.isnan(squares[1]).all() and (again[[0, 2, 3]] == expected[[0, 2, 3]]).all()
-    assert ((again >= 0) & (again < total)).all()
 
 
 # --- Recalling ----------------------------------------------------------------------------------
@@ -213,13 +195,3 @@ def test_of_equal_keys_the_newest_is_read_and_the_oldest_goes():
         memory.lay_out(np.zeros(1), np.ones(1))
         assert memory.recall(np.zeros((1, 1), np.float32))[0] == [result]
     assert sorted(memory.values[: len(memory), -1].tolist()) == [2, 3, 4, 5]
-
-
-def test_a_restored_memory_shares_nothing_with_the_original():
-    original, restored = make_memory(capacity=8), make_memory(capacity=8)
-    original.write(*experiences(6))
-    restored.load_state_dict(original.state_dict())
-    before = restored.keys.copy(), restored.usage.copy(), restored.values.copy()
-    original.write(*experiences(8, seed=2))
-    after = restored.keys, restored.usage, restored.values
-    assert all((old == new).all() for old, new in zip(before, after, strict=True))

@@ -1,9 +1,7 @@
 """Animations of agents: what is filmed is what was played, and how it is written."""
 
-import functools
 import gc
 import io
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -17,23 +15,9 @@ from mace_rl.runs import watch
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.evaluate import evaluate
-from mace_rl.runs.run import run
 from mace_rl.trainer import Trainer
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def finished(run_config, tmp_path_factory):
-    """`finished(environment)`: the folder of a run of two episodes."""
-
-    @functools.cache
-    def make(environment: str) -> Path:
-        folder = tmp_path_factory.mktemp(environment)
-        run(run_config(environment, episodes=2), folder)
-        return folder
-
-    return make
 
 
 class NoDisplay(CartPoleEnv):
@@ -44,8 +28,8 @@ class NoDisplay(CartPoleEnv):
 
 
 @pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0"])
-def test_what_is_filmed_is_what_evaluate_plays(finished, environment):
-    folder = finished(environment)
+def test_what_is_filmed_is_what_evaluate_plays(trained, environment):
+    folder = trained(environment, episodes=2)
     threshold = gc.get_threshold()
     gc.set_threshold(10)  # what is no longer used goes while the film is made
     try:
@@ -57,7 +41,7 @@ def test_what_is_filmed_is_what_evaluate_plays(finished, environment):
     assert len({picture.tobytes() for picture in film.pictures}) > len(film.pictures) / 2
 
 
-def test_the_untrained_agent_has_the_weights_that_training_began_with(finished, run_config):
+def test_the_untrained_agent_has_the_weights_that_training_began_with(trained, run_config):
     config = run_config(episodes=2)
     policy, env = Agent(Trainer(config).ppo).policy, gymnasium.make("CartPole-v1")
     env.reset(seed=5)
@@ -67,7 +51,7 @@ def test_the_untrained_agent_has_the_weights_that_training_began_with(finished, 
         action = int(policy(torch.from_numpy(observation)).probs.argmax())
         observation, _, *ends, _ = env.step(action)
         steps += 1
-    film = watch.film(finished("CartPole-v1"), 1, 5, deterministic=True, untrained=True)
+    film = watch.film(trained("CartPole-v1", episodes=2), 1, 5, deterministic=True, untrained=True)
     assert film.returns == [steps]
 
 
@@ -75,19 +59,20 @@ def test_the_untrained_agent_has_the_weights_that_training_began_with(finished, 
     ("environment", "rate", "stride", "durations"),
     [("CartPole-v1", 50, 3, {60}), ("Acrobot-v1", 15, 1, {60, 70})],  # a GIF has whole hundredths
 )
-def test_pictures_and_speed_are_the_environments(finished, environment, rate, stride, durations):
+def test_pictures_and_speed_are_the_environments(trained, environment, rate, stride, durations):
     """Thinned to at most 20 pictures a second, cut where it should be, and written whole."""
     env = gymnasium.make(environment, render_mode="rgb_array")
     env.reset(seed=0)
     env.reset()
     height, width, _ = env.render().shape
-    film = watch.film(finished(environment), seconds=0.2, width=width)
+    folder = trained(environment, episodes=2)
+    film = watch.film(folder, seconds=0.2, width=width)
     assert np.array_equal(np.asarray(film.pictures[0].crop((0, 0, width, height))), env.render())
     assert len(film.pictures) == 1 + rate // 5 // stride
     assert set(film.milliseconds[:-1]) == durations
     starts = np.cumsum([0, *film.milliseconds[:-1]])
     np.testing.assert_allclose(starts, np.arange(len(starts)) * 1000 * stride / rate, atol=5)
-    assert film.returns == evaluate(finished(environment), 1, 0).tolist()
+    assert film.returns == evaluate(folder, 1, 0).tolist()
     with Image.open(io.BytesIO(watch.gif(film))) as image:
         assert (image.format, image.info["loop"]) == ("GIF", 0)
         assert image.n_frames == len(film.pictures)
@@ -98,7 +83,7 @@ def test_pictures_and_speed_are_the_environments(finished, environment, rate, st
             assert abs(difference).mean() < 3
 
 
-def test_what_cannot_be_filmed_is_said(finished, tmp_path, register):
+def test_what_cannot_be_filmed_is_said(trained, tmp_path, register):
     register("NoDisplay-v0", NoDisplay)
     register("NoMode-v0", lambda: CartPoleEnv())  # takes no mode, though it promises one
     for name, reason in (
@@ -107,9 +92,10 @@ def test_what_cannot_be_filmed_is_said(finished, tmp_path, register):
         ("NoMode-v0", "with .* cannot be drawn"),
     ):
         with pytest.raises(watch.RenderError, match=f"'{name}' {reason}"):
-            watch.film(finished(name))
+            watch.film(trained(name, episodes=2))
+    folder = trained("CartPole-v1", episodes=2)
     for name in (files.RECORD, files.EPISODES):
-        (tmp_path / name).write_bytes((finished("CartPole-v1") / name).read_bytes())
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
     with pytest.raises(CheckpointError, match=r"agent\.pt: missing"):
         watch.film(tmp_path)
     assert watch.film(tmp_path, untrained=True).pictures  # needs no weights but the first
