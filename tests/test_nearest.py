@@ -38,6 +38,15 @@ def test_the_nearest_are_found_and_equals_in_order(seed, count_of_queries, total
     assert np.array_equal(np.concatenate([distances for distances, _ in single]), squared_distances)
 
 
+def test_what_comes_after_the_candidates_were_cut_down_still_counts():
+    """Three blocks have more points than are asked for; the fourth has one just within reach."""
+    draw = np.random.default_rng(0)
+    places = np.append(draw.permutation(192) + 1.0, [99.5, 1000, 1001])
+    points = places.astype(np.float32)[:, None]
+    _, indices = Neighbours(points, np.zeros(1), np.ones(1)).nearest(np.zeros((1, 1)), 100)
+    assert places[indices[0]].tolist() == [*range(1, 100), 99.5]
+
+
 def test_distances_are_in_the_units_given():
     points = np.array([[3.0, 10.0], [1.0, 20.0]], np.float32)
     near = Neighbours(points, np.array([1.0, 5.0]), np.array([2.0, 5.0]))

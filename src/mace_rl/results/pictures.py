@@ -201,7 +201,7 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
     reach = max(1, np.nanmax(ends.to_numpy()))
     claims = table.groupby("claim", sort=False)[["claim", "statement"]].first()
     width = 20 if table["measured"].nunique() > 1 else 40  # letters, beside what the parts are
-    said = {name: _wrapped(" ".join(claim), width) for name, claim in claims.T.items()}
+    said = {str(name): _wrapped(" ".join(own), width) for name, own in claims.T.items()}
     table, blocks = _placed(table, {name: len(text.splitlines()) for name, text in said.items()})
     count, ways = max(end for _, end in blocks.values()), table["measured"].unique()
     with style():
