@@ -69,6 +69,12 @@ def table_for_tables(
     return pd.DataFrame(rows)
 
 
+def digits_of(part: dict) -> int:
+    """With how many a part is printed: of a return so many that the margin has two figures."""
+    decimals = f"{part['worth_mentioning']:.1e}".partition("e")[2]
+    return {"episodes": 0, "return": max(1, 1 - int(decimals))}.get(part["unit"], 3)
+
+
 def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:
     """metrics.csv in which a variant is better by `advantage` of everything, in all it does."""
     draws = np.random.default_rng(1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from invented import table_for_claims
+from invented import digits_of, table_for_claims
 
 from mace_rl.config.study import read_study
 from mace_rl.results.claims import ledger
@@ -24,7 +24,7 @@ SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 500})
 def test_each_script_has_a_process_of_its_own_and_how_it_ended_is_heard(tmp_path: Path) -> None:
     script, trace = tmp_path / "script.py", tmp_path / "trace"
     jobs, scripts = tables.fork.Pipe()
-    server = tables.fork.Process(target=tables.run_scripts, args=(jobs, scripts))
+    server = tables.fork.Process(target=tables.run_scripts, args=(scripts, [(jobs, scripts)]))
     server.start()
     scripts.close()
     note = f"import os\nopen({str(trace)!r}, 'a').write(f'{{__name__}} {{os.getpid()}}\\n')\n"
@@ -56,7 +56,7 @@ def test_the_first_study_stands_beside_this_one_part_by_part() -> None:
     for claim, other in zip(second[2:], first[2:], strict=True):
         for part, old in zip(claim[ROBUST]["parts"], other[ROBUST]["parts"], strict=True):
             row = parts[4 + count]  # C1 and C2 have two parts each
-            digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+            digits = digits_of(part)
             assert [row[place] for place in (0, 4, 6, 7, 9)] == [
                 *(claim["claim"], "12", part["outcome"], "11", old["outcome"])
             ]

@@ -14,7 +14,7 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
-from invented import table_for_claims, table_for_tables
+from invented import digits_of, table_for_claims, table_for_tables
 
 from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.results import MetricsConfig
@@ -321,7 +321,7 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     assert f"{number(score['mean'], 3)} ({number(score['mean_low'], 3)} to" in page
     assert f"| mace_full | 10 | {', '.join(['0.50'] * 10)} |" in page
     for part in (part for claim in claims for part in claim[ROBUST]["parts"]):
-        digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+        digits = digits_of(part)
         shown = (number(part[name], digits) for name in ("difference", "low", "high"))
         assert "{} ({} to {})".format(*shown) in page
     # A study without them: no claims, nothing to compare, one environment, β as it was set.

@@ -17,12 +17,14 @@ import importlib
 import json
 import multiprocessing.connection
 import os
+import queue
 import re
 import runpy
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -41,6 +43,7 @@ from mace_rl.results.tables import parts
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
+CORES = len(os.sched_getaffinity(0))
 # What the workflow and its jobs import, or let be imported, which takes longer than most of the
 # jobs' work: imported once, before the processes of all of them are forked.
 SHARED = (
@@ -76,41 +79,51 @@ def make(name: str, study: dict[str, Any]) -> None:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     (folder / "runs").symlink_to("../runs", target_is_directory=True)
-    command = ["--cores", "1", "--allowed-rules", *RULES]
+    command = ["--cores", str(CORES), "--allowed-rules", *RULES]
     command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
     sys.argv = ["snakemake", *command]  # where profiles/default looks for --cores
-    jobs, scripts = fork.Pipe()
-    fork.Process(target=run_scripts, args=(jobs, scripts)).start()
-    scripts.close()  # so that an end of that process does not leave this one waiting
+    idle: queue.SimpleQueue[Connection] = queue.SimpleQueue()
+    pipes = [fork.Pipe() for _ in range(CORES)]
+    for jobs, scripts in pipes:
+        fork.Process(target=run_scripts, args=(scripts, pipes)).start()
+        idle.put(jobs)
+    for _, scripts in pipes:
+        scripts.close()  # so that an end of that process does not leave this one waiting
 
     def execute_script(_: object, script: str, edit: bool = False) -> None:
+        jobs = idle.get()
         jobs.send(script)
-        if status := jobs.recv():
+        status = jobs.recv()
+        idle.put(jobs)
+        if status:
             raise subprocess.CalledProcessError(status, script)
 
     snakemake.script.PythonScript.execute_script = execute_script
     try:
         snakemake.cli.main(command)
     finally:
-        jobs.send(None)
+        for jobs, _ in pipes:
+            jobs.send(None)
 
 
-def run_scripts(jobs: Connection, scripts: Connection) -> None:
+def run_scripts(mine: Connection, pipes: Sequence[tuple[Connection, Connection]]) -> None:
     """Run each script that comes in a process forked from this one, and send its exit status.
 
-    Not forked from Snakemake's own process, which has threads by then.
+    Not forked from Snakemake's own process, which has threads by then. mine: the end of one of
+    `pipes`. The others are closed, so that the end of Snakemake is the end of this.
     """
-    jobs.close()  # so that the end of Snakemake is the end of this
+    for end in (end for pipe in pipes for end in pipe if end is not mine):
+        end.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the scripts end, which Snakemake is to hear
-    for script in iter(scripts.recv, None):
+    for script in iter(mine.recv, None):
         process = fork.Process(
             target=runpy.run_path, args=(script,), kwargs={"run_name": "__main__"}
         )
         process.start()
         process.join()
-        scripts.send(process.exitcode)
+        mine.send(process.exitcode)
 
 
 def make_all(studies: dict[str, Any]) -> None:
@@ -128,7 +141,7 @@ def make_all(studies: dict[str, Any]) -> None:
     waiting = [(name, fork.Process(target=make, args=(name, studies[name]))) for name in studies]
     running: dict[Any, tuple[str, Any]] = {}  # by what is ready when the process ends
     while waiting or running:
-        while waiting and len(running) < len(os.sched_getaffinity(0)):
+        while waiting and len(running) < CORES:
             name, process = waiting.pop(0)
             process.start()
             running[process.sentinel] = name, process

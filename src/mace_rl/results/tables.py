@@ -5,6 +5,7 @@ A frame of cells has a table's heads as columns and what is printed as values: w
 in the data: `named` gives them other names first.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -217,7 +218,9 @@ def parts(claims: Sequence[Mapping[str, Any]], how: str, names: Mapping[str, str
     rows = []
     for claim in claims:
         for part in claim[how]["parts"]:
-            digits = {"episodes": 0, "return": 1}.get(part["unit"], 3)
+            # Of a return as many as the margin needs, which depends on the environment's scale.
+            of_return = max(1, 1 - math.floor(math.log10(part["worth_mentioning"])))
+            digits = {"episodes": 0, "return": of_return}.get(part["unit"], 3)
             pair = (names.get(name, name) for name in (part["variant"], part["baseline"] or "0"))
             margins = ("in_paper", "worth_mentioning", "detectable")
             rows.append(
