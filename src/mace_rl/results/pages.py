@@ -164,8 +164,9 @@ def _others(data: Data, settings: MetricsConfig) -> Iterator[str]:
     frame = tables.betas(data["betas"], settings)
     if len(frame):
         note = (
-            "Where β is not the same in every seed. With stagnation: mean over seeds of its rank"
-            " correlation with the stagnation before (C9)."
+            "Where β is not the same in every seed: of all seeds the least, the median and the"
+            " most. With stagnation: mean over seeds of its rank correlation with the stagnation"
+            " before (C9)."
         )
         yield _section("β", note, frame)
 

@@ -180,7 +180,7 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 
 def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """betas.csv: the variants whose β is not the same in every seed, and how it ended in each."""
+    """betas.csv: the variants whose β is not the same in every seed, and how it ended."""
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
         if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
@@ -188,12 +188,12 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         found = runs["stagnation_correlation"].to_numpy()
         low, high = interval(found, settings)
         seeds = (
-            ", ".join(number(beta, 2) for beta in sorted(runs[name]))
+            ", ".join(number(beta, 2) for beta in runs[name].quantile([0, 0.5, 1]))
             for name in ("beta_end", "beta_lowest")
         )
         correlation = Cell([estimate(found.mean(), float(low), float(high), 3)])
         rows.append([environment, variant, _number(len(runs)), *seeds, correlation])
-    heads = ["environment", "", "n", "β at the end, by seed", "lowest", "with stagnation"]
+    heads = ["environment", "", "n", "β at the end", "lowest β", "with stagnation"]
     return pd.DataFrame(rows, columns=heads)
 
 
