@@ -72,7 +72,7 @@ def test_every_run_came_after_the_page_and_from_one_state_of_the_code() -> None:
         pytest.skip("not a git repository with its whole history")
     records = [
         json.loads(content)
-        for archive in sorted((ROOT / "reference" / "study").glob("*/*.tar.xz"))
+        for archive in sorted((ROOT / "reference").glob("*/*/*.tar.xz"))
         for name, content in kept_runs.read(archive).items()
         if name.endswith(files.RECORD)
     ]
