@@ -146,10 +146,12 @@ class BarrenRegion(gymnasium.Env):
     numbers are 0.
 
     - PPO learns to leave the room, for its cost, and seldom strays as far as the goal.
-    - Novelty alone mostly outweighs the cost, as the screen never shows the same twice.
+    - Novelty alone can outweigh the cost, as the screen never shows the same twice.
     - With novelty × relevance the room is new at first too. But one number, unlike an image, is
       soon like one that memory holds, and nothing good came of that: less of the room's bonus is
       left against the cost, while what lies ahead in the corridor is like nothing remembered.
+
+    So it was meant; docs/study.md has what came out.
 
     `screen=0` is the control: the same room without news, where novelty alone should do well.
 

@@ -46,8 +46,9 @@ def _parts(claims: Ledger) -> Iterator[str]:
         yield (
             f"\n### Part by part: {how}\n\n"
             "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
-            " *P*: that a run of the first is better. *Margin*: what counts as an advantage worth"
-            f" mentioning. *Detectable*: the smallest that these seeds show with a power of"
+            " *p*: of no difference; *p within*: of one beyond the margin; both corrected for all"
+            " parts. *P*: that a run of the first is better. *Margin*: what is worth mentioning."
+            f" *Detectable*: the smallest that these seeds show with a power of"
             f" {POWER:.0%}, before correction.\n\n"
         )
         yield markdown(tables.parts(claims, how, {}))

@@ -222,7 +222,7 @@ def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-1.1 * reach, 1.8 * reach), yticks=[])
-            axes.set_xlabel(f"Difference in the claim's favour\n(1: {UNIT})")
+            axes.set_xlabel(f"Difference in favour of what is said\n(1: {UNIT})")
             for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
                 name = claim["claim"].iloc[0]
                 top, end = blocks[name]
