@@ -142,7 +142,8 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[str]:
         yield _section(f"{title}: who is better", note, tables.improvement(table, metric))
         note = (
             "Difference: mean over the seeds that both have (interval). p: of the sign-flip test,"
-            " by itself and corrected for all metrics, pairs and environments (comparisons.csv)."
+            " by itself and corrected for all metrics, pairs and environments (comparisons.csv);"
+            " verdicts have a correction of their own."
         )
         own = table[(table["metric"] == metric) & (table["env"] != ALL)]
         frame = tables.comparisons(own, data["supplement"], settings)
