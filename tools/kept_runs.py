@@ -8,7 +8,7 @@ Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which 
 what is not kept; of seed100 the agent too, unless it is large, which the report shows at play.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
 and without the columns that the others tell, which takes half the room. Packing again adds seeds to
-those that are there; equal runs give equal files. `make tables` reads what is in reference/study.
+those that are there; equal runs give equal files. `make tables` reads what is there.
 """
 
 import argparse

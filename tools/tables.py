@@ -3,12 +3,11 @@
     python -m tools.tables [--check]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-The runs in reference/study are unpacked, and Snakemake makes of them, into results/tables/STUDY,
-the outputs that reference/studies.yaml names, and README.md: tables.md with the pictures that are
-among these, and the verdicts of the first study beside those of this one. They are compared with
-those in reference/tables. New ones are kept there, and README.md, which only shows the others, is
-renewed; with --check both are mistakes. With --report only the page of one study is made, and not
-compared.
+The runs in `KEPT` are unpacked, and Snakemake makes of them, into results/tables/STUDY, the outputs
+that reference/studies.yaml names, and README.md: tables.md with the pictures that are among these,
+and the verdicts of the first study beside those of this one. They are compared with those in
+reference/tables. New ones are kept there, and README.md, which only shows the others, is renewed;
+with --check both are mistakes. With --report only the page of one study is made, and not compared.
 """
 
 import argparse
