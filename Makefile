@@ -58,7 +58,7 @@ verify: setup ## repeat a sample of the short runs and three of the study, and c
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 	folder=$$(mktemp -d)
 	trap 'rm -rf "$$folder"' EXIT
-	$(IN_VENV) tools.kept_runs unpack reference/confirmation "$$folder" --sample 3 >/dev/null
+	$(IN_VENV) tools.kept_runs unpack reference/study "$$folder" --sample 3 >/dev/null
 	$(IN_VENV) mace_rl.cli verify "$$folder"
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)

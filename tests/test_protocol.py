@@ -65,22 +65,25 @@ def test_configurations_have_the_runs_that_the_page_has() -> None:
 
 
 @pytest.mark.slow
-def test_every_run_came_after_the_page_and_from_one_state_of_the_code() -> None:
+def test_every_run_is_kept_and_came_after_the_page_and_from_one_state_of_the_code() -> None:
     git = ["git", "-C", str(ROOT)]
     if subprocess.run([*git, "rev-parse", "--is-shallow-repository"], capture_output=True,
                       text=True, check=False).stdout.strip() != "false":  # fmt: skip
         pytest.skip("not a git repository with its whole history")
-    records = [
-        json.loads(content)
-        for archive in sorted((ROOT / "reference").glob("*/*/*.tar.xz"))
+    records = {
+        tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
+        for archive in sorted((ROOT / "reference" / "study").glob("*/*.tar.xz"))
         for name, content in kept_runs.read(archive).items()
-        if name.endswith(files.RECORD)
-    ]
-    records = [record for record in records if record["config"]["seed"] in range(100, 200)]
-    if not records:
-        pytest.skip("no run of the confirmation is kept yet")
-    ((commit, dirty),) = {tuple(record["code"].values()) for record in records}
-    assert not dirty and len({record["sources"] for record in records}) == 1
+        if name.endswith(files.RECORD) and (record := json.loads(content))
+    }
+    records = {run: record for run, record in records.items() if run[2] in range(100, 200)}
+    assert records.keys() == {
+        run
+        for name in ("study", "questions")
+        for run in read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"]).runs()
+    }
+    ((commit, dirty),) = {tuple(record["code"].values()) for record in records.values()}
+    assert not dirty and len({record["sources"] for record in records.values()}) == 1
     log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(PAGE)], capture_output=True,
                          text=True, check=True)  # fmt: skip
     subprocess.run([*git, "merge-base", "--is-ancestor", log.stdout.strip(), commit], check=True)

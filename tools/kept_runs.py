@@ -42,8 +42,6 @@ def read(archive: Path) -> dict[str, bytes]:
     with tarfile.open(fileobj=io.BytesIO(content)) as tar:
         members = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
         found = {name: file.read() for name, file in members if file is not None}
-    if not found.keys() >= set(COLUMNS):  # of the first study, which has the files as they were
-        return found
     columns = {name: found.pop(name).decode().splitlines() for name in COLUMNS}
     seeds = [name for name in found if name.endswith(files.RECORD)]
     start = 0

@@ -53,9 +53,7 @@ SHARED = (
 )
 fork = multiprocessing.get_context("fork")
 
-# The first study's, and what there is of the second.
-KEPT = Path("reference/study"), Path("reference/confirmation")
-STUDIES = Path("reference/studies.yaml")
+KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 FIRST = Path("reference/measured/first_study.json")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
@@ -161,8 +159,7 @@ def write_readme(name: str, outputs: list[str]) -> None:
     text = (MADE / name / TABLES).read_text(encoding="utf-8")
     text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
     text = re.sub("^# .*", f"# {name}", text)
-    # Until the second study of the claims is complete, the one that is kept is the first.
-    if (ledger := MADE / name / "claims.json").exists() and name != "study":
+    if (ledger := MADE / name / "claims.json").exists():
         first, second = (json.loads(path.read_text(encoding="utf-8")) for path in (FIRST, ledger))
         text += beside_the_first(first, second["claims"])
     (MADE / name / README).write_text(text, encoding="utf-8")
@@ -221,10 +218,10 @@ def main() -> None:
         if stale.exists():
             shutil.rmtree(stale)
     with ThreadPoolExecutor(1) as beside:
-        unpacked = [beside.submit(kept_runs.unpack, one, MADE) for one in KEPT if one.exists()]
+        unpacked = beside.submit(kept_runs.unpack, KEPT, MADE)
         for module in SHARED:
             importlib.import_module(module)
-        runs = sum(one.result() for one in unpacked)
+        runs = unpacked.result()
     if only:
         make_all({only: {**studies[only], "outputs": [PAGE]}})
         print(MADE / only / PAGE)
