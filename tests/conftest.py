@@ -23,6 +23,7 @@ from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.config.study import Study, read_study
+from mace_rl.environments import registered
 
 if TYPE_CHECKING:
     from mace_rl.agent.ppo import PPO
@@ -111,7 +112,7 @@ def make_ppo(run_config):
 @pytest.fixture
 def register() -> Iterator[Callable[..., str]]:
     """`register(name, entry_point, max_episode_steps, **kwargs)`: an environment for one test."""
-    before = dict(gymnasium.registry)
+    before = dict(registered())  # with Bullet's, which are registered once in a process
 
     def make(name: str, entry_point: Any, max_episode_steps: int | None = 10, **kwargs: Any) -> str:
         gymnasium.registry.pop(name, None)
