@@ -1,6 +1,7 @@
 """The study: merging of settings, and a clear refusal of every kind of mistake."""
 
 import copy
+import os
 import re
 import subprocess
 import sys
@@ -293,7 +294,7 @@ def test_a_value_is_what_was_typed(tmp_path: Path, given: str, expected: Any) ->
     assert read_yaml(tmp_path / "file.yaml") == {"key": expected}
 
 
-def test_options_go_over_one_another_and_their_texts_have_no_comments() -> None:
+def test_options_go_over_one_another_and_have_no_comments() -> None:
     assert read_options(["a={b: 1, c: 2}", "a={c: 3}"]) == {"a": {"b": 1, "c": 3}}
     assert read_options(["results=a #b"]) == {"results": "a #b"}
 
@@ -308,7 +309,7 @@ def test_labels_have_what_the_figures_font_has() -> None:
 
 def test_every_variant_has_a_colour_of_its_own() -> None:
     own = {f"v{place}": {"beta": {"kind": "none"}} for place in range(60)}
-    own["v7"] |= {"colour": "#7f7f7f"}  # tab:gray
+    own["v7"] |= {"colour": "#7f7f7f"}  # tab:gray, which is then not another's
     study = load_study(changed({"variants": list(own), "variant_settings": own}), "test")
     colours = list(study.colours.values())
     assert len(set(map(to_hex, colours))) == 60
@@ -319,8 +320,9 @@ def test_planning_imports_nothing_slow() -> None:
     """Whatever of this project the rules import."""
     rules = [line for rule in RULES.glob("*.smk") for line in rule.read_text("utf-8").splitlines()]
     code = [line for line in rules if line.startswith(("from ", "import ")) and "mace_rl" in line]
-    code = "\n".join([*code, "import sys; print(*sys.modules)"])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = "\n".join([*code, "import matplotlib.colors, sys; print(*sys.modules)"])
+    command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": "of a notebook"}
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert "mace_rl.config.study" in loaded
     assert not loaded & {"torch", "numba", "pandas", "scipy.stats", "matplotlib.pyplot", "pybullet"}
