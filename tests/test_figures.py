@@ -142,12 +142,8 @@ def test_a_mean_that_covers_another_leaves_gaps_to_see_it_by():
 
 # Of somebody's matplotlibrc.
 USERS = {"text.usetex": True, "font.size": 30, "font.family": "serif", "savefig.bbox": "tight"}
-USERS |= {
-    "axes.formatter.use_locale": True,
-    "axes.formatter.limits": [0, 0],
-    "path.simplify": False,
-}
-USERS |= {"axes.prop_cycle": matplotlib.cycler(color="r"), "pdf.compression": 0, "axes.grid": True}
+USERS |= {"axes.formatter.use_locale": True, "path.simplify": False, "pdf.compression": 0}
+USERS |= {"axes.prop_cycle": matplotlib.cycler(color="r"), "axes.grid": True}
 
 
 def test_labels_are_plain_text(monkeypatch):

@@ -6,12 +6,13 @@ import os
 import re
 import shlex
 import sys
+from functools import reduce
 from pathlib import Path
 
 from mace_rl import files
-from mace_rl.config.reading import read_options
+from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import folder_of, read_study
+from mace_rl.config.study import folder_of, load_study
 from mace_rl.config.plugins import source_file
 from mace_rl.environments import registered
 from mace_rl.results import paper, protocol
@@ -29,7 +30,8 @@ try:
     # Files and options are read again: Snakemake makes 20241125 of `--config results=2024_11_25`.
     options = workflow.config_settings.config_args
     replaced = workflow.config_settings.replace_workflow_config  # then the first is left out
-    study = read_study(list(map(Path, config_files[replaced:])), over=read_options(options))
+    layers = [*(read_yaml(Path(file)) for file in config_files[replaced:]), read_options(options)]
+    study = load_study(reduce(merge, layers), origin)
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {error}")
 try:

@@ -72,12 +72,11 @@ def _read(text: str, origin: str) -> Any:
     """The value of a YAML text; a `ConfigError` with the place of the first mistake."""
     try:
         return yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise ConfigError(f"{origin}{place}: not valid YAML: {error.problem}") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"{origin}: not valid YAML: {' '.join(str(error).split())}") from None
+        mark = getattr(error, "problem_mark", None)
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ConfigError(f"{origin}{place}: not valid YAML: {problem}") from None
 
 
 DEEPEST, MOST = 50, 100_000  # levels of nesting, and values for which aliases stand
@@ -111,17 +110,15 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event, before = self.peek_event(), self.count  # type: ignore[no-untyped-call]
-        if isinstance(event, yaml.AliasEvent):
-            node = super().compose_node(parent, index)
-            self.count += self.sizes.get(node, MOST)  # it stands in what it names
-            _refuse(self.count > MOST, "aliases that stand for too much", event)
-            return node
+        alias, tag = isinstance(event, yaml.AliasEvent), getattr(event, "tag", None)
         self.depth, self.count = self.depth + 1, self.count + 1
         _refuse(self.depth > DEEPEST, f"more than {DEEPEST} levels", event)
-        _refuse(event.tag is not None, f"the tag {event.tag!r}", event)
+        _refuse(tag is not None, f"the tag {tag!r}", event)
         node = super().compose_node(parent, index)
+        self.count += self.sizes.get(node, MOST) if alias else 0  # MOST: of what it stands in
+        _refuse(alias and self.count > MOST, "aliases that stand for too much", event)
+        self.sizes.setdefault(node, self.count - before)
         self.depth -= 1
-        self.sizes[node] = self.count - before
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:

@@ -10,8 +10,6 @@ from pydantic_core import ErrorDetails
 
 from mace_rl.refusal import Refusal
 
-_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
-
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -82,12 +80,11 @@ def _advice(problem: ErrorDetails) -> str:
     if wanted == "bool_type" and isinstance(value, str):
         return " (write true or false)"
     text = str(value).replace("_", "")
-    if wanted in ("int_type", "float_type") and re.fullmatch(_NUMBER, text):
+    if re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text):
         number = float(text)
-        if number.is_integer() or wanted == "float_type":
-            shown = int(number) if number.is_integer() and abs(number) < 2**53 else number
-            how = "YAML takes it for text: " if isinstance(value, str) else ""
-            return f" ({how}write {shown!r}{', without quotes' if how else ''})"
+        if wanted == "float_type" or (wanted == "int_type" and number.is_integer()):
+            quotes = ", without quotes" if isinstance(value, str) else ""
+            return f" (write {short(int(number) if number.is_integer() else number)}{quotes})"
     return ""
 
 

@@ -123,9 +123,9 @@ class Study(Section):
 
         hues = (hsv_to_rgb(0.618 * n % 1, 1, (0.4, 0.7, 1)[n % 3]) for n in itertools.count())
         given = {name: variant.colour for name, variant in self.variant_settings.items()}
-        taken = {to_hex(colour) for colour in given.values() if colour is not None}
-        palette = itertools.chain(TABLEAU_COLORS, map(to_hex, hues))
-        free = (colour for colour in palette if to_hex(colour) not in taken)
+        taken = set(map(to_hex, filter(None, given.values())))
+        every = itertools.chain(TABLEAU_COLORS, map(to_hex, hues))
+        free = (colour for colour in every if to_hex(colour) not in taken)
         colours = {name: colour or next(free) for name, colour in given.items()}
         return {name: colours[name] for name in self.variants}
 
@@ -153,13 +153,20 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     `origin` (file names) starts the message of the `ConfigError`, one line with the key, the value
     and what would be right, that the first mistake raises.
     """
+    from matplotlib.colors import is_color_like
+
     study = check(Study, {str(key): value for key, value in config.items()}, origin)
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
         for variant in study.variant_settings:
             _check_name(variant, "variant_settings")
-            _check_colour(variant, study.variant_settings[variant].colour)
+        for variant, shown in study.variant_settings.items():
+            if shown.colour is not None and not is_color_like(shown.colour):
+                raise ConfigError(
+                    f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"
+                    " of Matplotlib's, such as tab:blue or '#1f77b4'"
+                )
         [(label, count)] = Counter(study.labels.values()).most_common(1)
         if count > 1:
             raise ConfigError(
@@ -195,18 +202,16 @@ def folder_of(environment: str) -> str:
     return environment.replace("/", "+")
 
 
-def read_study(
-    paths: Sequence[Path], every_run: bool = True, over: Settings | None = None
-) -> Study:
-    """The study of one YAML file, others read over it, and `over`: mappings merge, lists replace.
+def read_study(paths: Sequence[Path], every_run: bool = True) -> Study:
+    """The study of one YAML file and others read over it: mappings merge, lists are replaced.
 
     Without `every_run` each is checked when it is asked for, and packages that others need may be
     missing. Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a
     file gives twice, and everything that `load_study` refuses.
     """
     config: Settings = {}
-    for layer in (*map(read_yaml, paths), over or {}):
-        config = merge(config, layer)
+    for path in paths:
+        config = merge(config, read_yaml(path))
     origin = " + ".join(str(path) for path in paths)
     return load_study(config, origin) if every_run else check(Study, config, origin)
 
@@ -265,16 +270,6 @@ def _check_name(environment: str, key: str) -> None:
             f"{key} has {short(environment)}, but a name here becomes a folder: it should be up to "
             "200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
             "environment's may stand a module and ':', then a namespace and '/'"
-        )
-
-
-def _check_colour(variant: str, colour: str | None) -> None:
-    from matplotlib.colors import is_color_like
-
-    if colour is not None and not is_color_like(colour):
-        raise ConfigError(
-            f"variant_settings.{variant}.colour is {colour!r}, but it should be a colour of "
-            "Matplotlib's, such as tab:blue or '#1f77b4'"
         )
 
 

@@ -247,17 +247,16 @@ def style() -> Iterator[None]:
     fonts = {"font.family": "DejaVu Sans", "pdf.fonttype": 42}  # this font comes with matplotlib
     fonts |= {"svg.fonttype": "none", "svg.hashsalt": "mace_rl"}  # text as text; ids that stay
     fonts |= {"text.parse_math": False}  # a label may have a $
-    own = (
-        seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
-        | seaborn.plotting_context("paper", font_scale=0.9)
-        | {"legend.frameon": False, "legend.title_fontsize": "small", "axes.linewidth": 0.8}
-        | {"axes.titlesize": "small", "figure.labelsize": "medium"}
-        | {f"{axis}tick.major.{part}": size for axis in "xy" for part, size in _TICKS.items()}
-        | fonts
-    )
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(own)
+        matplotlib.rcParams.update(
+            seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
+            | seaborn.plotting_context("paper", font_scale=0.9)
+            | {"legend.frameon": False, "legend.title_fontsize": "small", "axes.linewidth": 0.8}
+            | {"axes.titlesize": "small", "figure.labelsize": "medium"}
+            | {f"{axis}tick.major.{part}": size for axis in "xy" for part, size in _TICKS.items()}
+            | fonts
+        )
         yield
 
 
