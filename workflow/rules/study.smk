@@ -12,7 +12,7 @@ from mace_rl import files
 from mace_rl.config.reading import merge, read_yaml, typed
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import folder_of, load_study
-from mace_rl.config.plugins import source_file
+from mace_rl.config.plugins import code_outside, source_file
 from mace_rl.environments import registered
 from mace_rl.results import paper, protocol
 from mace_rl.results.metrics import all_metrics
@@ -92,6 +92,14 @@ def ppo_settings():
         others = {name: settings for name, settings in own.items() if settings != found[env]}
         found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
     return found
+
+
+def own_code():
+    """The settings of the runs whose agents are shown, where these name the user's own code."""
+    shown = [
+        study.run_config(*run).settings() for run in {run[:2]: run for run in RUNS[::-1]}.values()
+    ]
+    return [settings for settings in shown if code_outside(settings)]
 
 
 def most_work(wildcards):
