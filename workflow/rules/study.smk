@@ -96,9 +96,8 @@ def ppo_settings():
 
 def own_code():
     """The settings of the runs whose agents are shown, where these name the user's own code."""
-    shown = [
-        study.run_config(*run).settings() for run in {run[:2]: run for run in RUNS[::-1]}.values()
-    ]
+    first = {run[:2]: study.run_config(*run) for run in reversed(RUNS)}  # of its seeds
+    shown = [config.settings() for config in first.values()]
     return [settings for settings in shown if code_outside(settings)]
 
 

@@ -34,9 +34,9 @@ def animations(
     """Films of one run of each environment and variant, and sentences on what there is not.
 
     `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
-    agents do the same share that film. `own` are configurations that may name code from outside this
-    package, as in `run.json`. An agent that is not there and an environment that cannot be
-    drawn are said; an agent that is not the one of its `run.json` is an error.
+    agents do the same share that film. Runs may name code from outside this package if their
+    configuration is among the reader's `own`. An agent that is not there and an environment that
+    cannot be drawn are said; an agent that is not the one of its `run.json` is an error.
     """
     missing = []
     without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]

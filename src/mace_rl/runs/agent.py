@@ -135,7 +135,7 @@ def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:
     agent = Agent(trainer)
     wanted = agent.state_dict()
     for name in [*wanted, *state]:
-        found, right = (_kind(entries.get(name)) for entries in (state, wanted))
+        found, right = _kind(state.get(name)), _kind(wanted.get(name))
         if found != right:
             raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
         bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
