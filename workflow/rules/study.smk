@@ -13,7 +13,7 @@ from mace_rl import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import folder_of, load_study
-from mace_rl.config.plugins import source_file
+from mace_rl.config.plugins import code_outside, source_file
 from mace_rl.environments import registered
 from mace_rl.results import paper, protocol
 from mace_rl.results.metrics import all_metrics
@@ -91,6 +91,13 @@ def ppo_settings():
         others = {name: settings for name, settings in own.items() if settings != found[env]}
         found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
     return found
+
+
+def own_code():
+    """The settings of the runs whose agents are shown, where these name the user's own code."""
+    first = {run[:2]: study.run_config(*run) for run in reversed(RUNS)}  # of its seeds
+    shown = [config.settings() for config in first.values()]
+    return [settings for settings in shown if code_outside(settings)]
 
 
 def most_work(wildcards):
