@@ -258,7 +258,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         commands[arguments.command](arguments)
-    except (Refusal, OSError) as error:
+    except (Refusal, OSError, MemoryError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except ModuleNotFoundError as error:
         if (

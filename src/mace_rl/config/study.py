@@ -44,8 +44,9 @@ def _folder(path: str) -> str:
     if not path.strip() or re.search(r"[{}\n\r\0*?\[\]]", path):
         raise ValueError("it should be the path of a folder, without {}*?[]")
     for part in (Path(path), *Path(path).parents):
-        if part.exists() and not part.is_dir():
-            raise ValueError(f"it should be a folder, and {part} is a file")
+        if not part.is_dir() and (part.exists() or part.is_symlink()):
+            found = "file" if part.exists() else "link that leads nowhere"
+            raise ValueError(f"it should be a folder, and {part} is a {found}")
     return path
 
 
