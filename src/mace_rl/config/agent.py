@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section
+from mace_rl.config.section import Count, Reference, Section, Units
 
 
 class CompiledNetwork(Section):
@@ -72,7 +72,7 @@ class PPOConfig(Section):
     rollout_steps: Count
     minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
-    hidden_units: list[Count] = Field(min_length=1)
+    hidden_units: list[Units] = Field(min_length=1)
     critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat

@@ -4,13 +4,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section
+from mace_rl.config.section import Count, Reference, Section, Units
 
 
 class MetaConfig(Section):
     """Meta-adaptation network: the LSTM that sets β (paper, supplement)."""
 
-    hidden_units: Count
+    hidden_units: Units
     learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
     max_gradient_norm: PositiveFloat
     horizon: Count  # updates after an episode that judge its β

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section
+from mace_rl.config.section import Count, Reference, Section, Units
 
 
 class MemoryConfig(Section):
@@ -39,7 +39,7 @@ class NoveltyConfig(Section):
     refresh_every: Count  # steps after which what is new is judged anew, at an episode's end
     calibration_states: Count  # a sample of them says what distance is usual
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
-    density_hidden_units: Count
+    density_hidden_units: Units
     density_learning_rate: PositiveFloat = Field(lt=1)
     density_batch_size: Count
     density_steps: Count  # gradient steps of the density estimator in a refresh
@@ -73,8 +73,8 @@ class ICMBonus(Section):
     """Intrinsic curiosity module (Pathak et al. 2017): `mace_rl.bonus.icm`."""
 
     kind: Literal["icm"]
-    feature_units: Count = 32  # numbers in φ(s); the paper has 288 for images
-    hidden_units: Count = 64  # of the one hidden layer in each of its three networks
+    feature_units: Units = 32  # numbers in φ(s); the paper has 288 for images
+    hidden_units: Units = 64  # of the one hidden layer in each of its three networks
     learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper's
     batch_size: Count = 64  # steps; each episode is learnt from once
     forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
@@ -85,8 +85,8 @@ class RNDBonus(Section):
     """Random network distillation (Burda et al. 2018): `mace_rl.bonus.rnd`."""
 
     kind: Literal["rnd"]
-    feature_units: Count = 64  # outputs of both networks; the paper has 512 for images
-    hidden_units: Count = 64  # of the one hidden layer in each
+    feature_units: Units = 64  # outputs of both networks; the paper has 512 for images
+    hidden_units: Units = 64  # of the one hidden layer in each
     learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper has 0.0001, for images
     batch_size: Count = 64  # steps; each episode is learnt from once
 

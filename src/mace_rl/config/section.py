@@ -26,6 +26,7 @@ class Section(BaseModel):
 
 # A number of things, for all of which there may have to be room at once.
 Count = Annotated[int, Field(gt=0, le=10**7)]
+Units = Annotated[int, Field(gt=0, le=10**4)]  # in a layer of a network
 
 
 def _reference(text: str) -> str:

@@ -55,8 +55,10 @@ class Spaces:
                 vector[place] = 1.0
                 return vector
         elif given.size == self.observation_size and given.dtype.kind in NUMBERS:
-            with np.errstate(over="ignore"):  # what becomes infinite is found in the next line
-                vector = given.astype(np.float32, copy=False).ravel()
+            vector = given.ravel()
+            if vector.dtype != np.float32:
+                with np.errstate(over="ignore"):  # what becomes infinite is found in the next line
+                    vector = vector.astype(np.float32)
             if not all_below(vector, TOO_LARGE):
                 require_finite("the observation", given.astype(float), _after(step), TOO_LARGE)
             return vector
