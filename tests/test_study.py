@@ -111,6 +111,8 @@ results: 5  # results, 5, string
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
 results: CONFIG/x  # results, CONFIG, is a file
+training: {memory: {capacity: 1000000000000}}  # memory.capacity, less than or equal to 10000000
+training: {ppo: {hidden_units: [1000000]}}  # ppo.hidden_units, less than or equal to 10000
 """
 
 
