@@ -88,9 +88,9 @@ class Environment(Spaces):
             )
         with trying_out(f"environment {name!r}{f' with {arguments}' if arguments else ''}"):
             self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
-        space = self.env.observation_space
-        if isinstance(space, Tuple | Dict):
-            require_vectors(name, space, parts=True)
+        self.given_space = self.env.observation_space  # that of what it gives, before `encode`
+        if isinstance(self.given_space, Tuple | Dict):
+            require_vectors(name, self.given_space, parts=True)
             self.env = FlattenObservation(self.env)
         super().__init__(name, self.env.observation_space, self.env.action_space)
         if isinstance(self.action_space, Box) and self.action_space.dtype.kind != "f":
