@@ -1,10 +1,10 @@
 """Settings of `mace_rl.agent`: networks, critics and PPO."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from mace_rl.config.section import Reference, Section
+from mace_rl.config.section import Arguments, Reference, Section
 
 
 class CompiledNetwork(Section):
@@ -18,7 +18,7 @@ class TorchModule(Section):
 
     kind: Literal["torch"]
     module: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 NetworkConfig = CompiledNetwork | TorchModule
