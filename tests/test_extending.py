@@ -56,7 +56,7 @@ def replace(file: Path, old: str, new: str) -> None:
 def test_every_example_is_one_file_and_one_entry():
     assert {Path(name).suffix for name in FILES} == {".py", ".yaml"}
     assert all(f"{Path(name).stem}.yaml" in FILES for name in FILES)
-    assert set(TRAININGS) == {"layer_norm", "grid_counts", "linear_decay", "chain"}
+    assert set(TRAININGS) == {"layer_norm", "grid_counts", "linear_decay", "chain", "growing_chain"}
 
 
 @pytest.mark.parametrize("name", TRAININGS)
@@ -77,6 +77,16 @@ def test_example_trains(folder, train, name):
             np.testing.assert_allclose(episodes["beta"], expected)
         case "chain":
             assert (episodes["length"] <= 50).all() and episodes["extrinsic_return"].max() == 1
+        case "growing_chain":  # from a place 2 of 4, one step is enough the first time only
+            assert episodes["extrinsic_return"].sum() >= 2
+
+
+def test_the_example_s_state_is_saved(folder, run_config, kill, checkpoint_every, completes):
+    settings = {"episodes": 20, "max_episode_steps": 50}
+    config = run_config("growing_chain:GrowingChain-v0", "ppo", 0, **settings)
+    checkpoint_every(1)
+    kill(15, config, folder / "killed")
+    assert completes(config, folder / "killed")["interruptions"][0]["environment_replayed"]
 
 
 def test_edit_of_the_user_s_file_makes_it_another_run(folder, train):

@@ -259,10 +259,7 @@ def left_alone() -> Iterator[None]:
 
 @contextmanager
 def exclusive(directory: Path) -> Iterator[int]:
-    """Hold the run's folder for this process; the lock goes with the process, however it ends.
-
-    Gives the descriptor of the lock's file.
-    """
+    """Hold the run's folder for this process, by a file; the lock goes with the process."""
     # A file of its own: a folder on a network's disk can be locked by two machines at once.
     descriptor = os.open(directory / files.LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
