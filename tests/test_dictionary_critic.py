@@ -115,7 +115,7 @@ def test_the_actor_learns_as_with_networks(make_ppo):
 def test_agent_on_disk_has_the_same_values(run_config, trained, environment, normalise):
     ppo = {"critic": DICTIONARY, "normalise_observations": normalise}
     config = run_config(environment, "mace_fixed", 0, episodes=4, ppo=ppo)
-    empty, trainer = Agent(Trainer(config).ppo), finish(config)
+    empty, trainer = Agent(Trainer(config)), finish(config)
     agent = load_agent(trained(environment, "mace_fixed", episodes=4, ppo=ppo))
     space = trainer.environment.observation_space
     space.seed(0)

@@ -84,4 +84,4 @@ def train(
         directory = Path(folder or scratch)
         if restart or not finished(settings, directory):
             run(settings, directory, None, False, callback, "all" if restart else "nothing")
-        return Trained(load_agent(directory), read_rows(directory / files.EPISODES))
+        return Trained(load_agent(directory, trust=True), read_rows(directory / files.EPISODES))
