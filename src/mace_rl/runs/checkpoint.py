@@ -17,7 +17,8 @@ from mace_rl.config.section import short
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 
-PLAIN = (torch.Tensor, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
+TENSORS = (torch.Tensor, torch.nn.Parameter)
+PLAIN = (*TENSORS, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
 
 
 class CheckpointError(Refusal, ValueError):
