@@ -27,6 +27,7 @@ from mace_rl.agent.ppo import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
+from mace_rl.environments import resuming
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
 from mace_rl.experience import (
@@ -64,6 +65,7 @@ class Trainer:
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
+        self.last_episodes: list[dict[str, Any]] = []
 
     def run(self) -> Iterator[list[EpisodeRecord]]:
         """Train to the last episode; yields the records of each round after its update.
@@ -100,7 +102,9 @@ class Trainer:
         wanted = self.config.ppo.rollout_steps
         while collected < wanted and len(self.records) < self.config.episodes:
             noise = draw_noise(self.environment, self.noise)
+            start = resuming.state_of(self.environment)
             episode = self.play(self.environment, policy, noise)
+            self.last_episodes = resuming.remember(self.last_episodes, start, episode)
             rollout.append(self.appraise(episode))
             collected += len(episode)
         return rollout
@@ -217,7 +221,8 @@ class Trainer:
             "curiosity": self.curiosity.state_dict() if self.curiosity is not None else None,
             "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
-            "environment": self.environment.generator.bit_generator.state,
+            "environment": resuming.state_of(self.environment),
+            "last_episodes": self.last_episodes,
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
             "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }
@@ -229,7 +234,8 @@ class Trainer:
             self.curiosity.load_state_dict(state["curiosity"])
             self.controller.load_state_dict(state["controller"])
         self.noise.bit_generator.state = state["noise"]
-        self.environment.generator.bit_generator.state = state["environment"]
+        resuming.set_state(self.environment, state["environment"])
+        self.last_episodes = state["last_episodes"]
         self.records = as_rows(EpisodeRecord, state["records"])
         self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
 

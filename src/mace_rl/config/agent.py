@@ -1,10 +1,10 @@
 """Settings of `mace_rl.agent`: networks, critics and PPO."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section, Units
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class CompiledNetwork(Section):
@@ -18,7 +18,7 @@ class TorchModule(Section):
 
     kind: Literal["torch"]
     module: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 NetworkConfig = CompiledNetwork | TorchModule

@@ -1,10 +1,10 @@
 """Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section, Units
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class MetaConfig(Section):
@@ -99,7 +99,7 @@ class CustomBeta(Section):
 
     kind: Literal["custom"]
     rule: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 BetaRule = ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | CustomBeta

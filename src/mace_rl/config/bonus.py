@@ -1,10 +1,10 @@
 """Settings of `mace_rl.bonus`: memory, novelty, and the bonuses that can be had."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from mace_rl.config.section import Count, Reference, Section, Units
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class MemoryConfig(Section):
@@ -31,7 +31,7 @@ class NoveltyConfig(Section):
     # **arguments), with what mace_rl.bonus.novelty.Novelty asks for.
     kind: Literal["auto", "counts", "density", "custom"] = "auto"
     estimator: Reference | None = None
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
     count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
     buffer_size: Count  # visited states that k-NN and density refer to, a cover of ...
     write_every: Count  # ... one in so many
@@ -107,7 +107,7 @@ class CustomBonus(Section):
 
     kind: Literal["custom"]
     estimator: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 BonusConfig = CuriosityBonus | ICMBonus | RNDBonus | HashCountsBonus | CustomBonus
