@@ -8,7 +8,7 @@ from mace_rl.config.section import Reference, Section
 
 
 class MemoryConfig(Section):
-    """Episodic memory: a differentiable neural dictionary (paper, supplement)."""
+    """Episodic memory: a neural dictionary (paper, supplement)."""
 
     capacity: PositiveInt  # entries
     neighbours: PositiveInt  # k of the top-k lookup

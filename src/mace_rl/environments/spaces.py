@@ -38,6 +38,7 @@ class Spaces:
             if isinstance(observations, Discrete)
             else int(np.prod(observations.shape))
         )
+        self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
 
     def encode(self, observation: Any) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]; may be the same memory.

@@ -10,21 +10,22 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, Independent, Normal
+from torch.distributions import Distribution
 
 from mace_rl import files
-from mace_rl.agent import kernels
-from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing, Policy
+from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import PPO
+from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.environments.environment import Environment
+from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError, unarchive
 from mace_rl.runs.provenance import file_digest, read_record
 from mace_rl.trainer import Trainer
 
 
-class PolicyModule(torch.nn.Module):
+class PolicyModule(TorchPolicy):
     """π(·|s) for observations as the environment gives them (Discrete ones: one-hot)."""
 
     mean: Tensor
@@ -32,11 +33,7 @@ class PolicyModule(torch.nn.Module):
     clip: Tensor
 
     def __init__(self, ppo: PPO) -> None:
-        super().__init__()
-        self.network = ppo.policy.network.module()
-        self.discrete = ppo.policy.discrete
-        if not self.discrete:
-            self.log_std = torch.nn.Parameter(torch.from_numpy(ppo.policy.log_std.copy()))
+        super().__init__(ppo.policy)
         mean, std, clip = ppo.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
@@ -49,10 +46,7 @@ class PolicyModule(torch.nn.Module):
         """
         observations = torch.as_tensor(observations)
         seen = ((observations - self.mean) / self.std).clip(-self.clip, self.clip).float()
-        outputs = self.network(seen)
-        if self.discrete:
-            return Categorical(logits=outputs)
-        return Independent(Normal(outputs, self.log_std.exp()), 1)
+        return super().forward(seen)
 
 
 class Agent(torch.nn.Module):
@@ -72,10 +66,7 @@ class MostProbable(NetworkActing):
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """See `ActingPolicy`; the noise does not matter."""
-        seen = np.empty_like(self.mean)
-        kernels.normalise(observation, self.mean, self.inverse_std, self.clip, seen)
-        with torch.no_grad():
-            outputs = self.policy.network.forward(seen[None]).outputs
+        outputs = self.outputs(observation)
         action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]
         return action, self.policy.log_probs(outputs, np.array([action]))[0]
 
@@ -103,21 +94,15 @@ def load_acting(directory: Path, deterministic: bool = False) -> tuple[Environme
     if not policy.discrete:
         policy.log_std[:] = state["policy.log_std"].numpy()
     mean, std = state["policy.mean"].numpy(), state["policy.std"].numpy()
-    clip = float(state["policy.clip"])
-    return trainer.environment, acting(policy, mean, std, clip, deterministic)
+    normalisation = Normalisation.of(mean, std, float(state["policy.clip"]))
+    return trainer.environment, acting(trainer.ppo, normalisation, deterministic)
 
 
-def acting(
-    policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float, deterministic: bool
-) -> ActingPolicy:
-    """The policy for rollouts, with observation normalisation in front of it.
-
-    It samples its actions, or if `deterministic` takes the most probable ones.
-    """
-    if not deterministic:
-        return policy.for_acting(mean, std, clip)
-    unit = (1.0 / std).astype(np.float32)
-    return MostProbable(policy, mean.astype(np.float32), unit, np.float32(clip))
+def acting(ppo: PPO, normalisation: Normalisation, deterministic: bool) -> ActingPolicy:
+    """The policy for rollouts: it samples its actions, or takes the most probable ones."""
+    if deterministic:
+        return MostProbable(ppo.policy, normalisation)
+    return ppo.learner.acting(normalisation)
 
 
 def read_agent(directory: Path) -> tuple[RunConfig, dict[str, Tensor]]:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mace_rl.compiling import njit
+from mace_rl.numerics.compiling import njit
 from mace_rl.refusal import Refusal
 
 
@@ -21,7 +21,7 @@ def require_finite(name: str, values: float | np.ndarray, where: str = "") -> No
         raise NonFiniteError(f"{name} is {bad}{where}")
 
 
-def require_share(
+def require_within(
     name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
 ) -> None:
     """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`].
