@@ -28,6 +28,7 @@ RATE = "environment steps per CPU second"
 
 def write(folder: Path) -> Path:
     """Write the page of the folder's measurements, and return its path."""
+    matplotlib.rcdefaults()  # not the user's
     rows = pd.read_csv(folder / FILE)
     text = HEAD
     for section, (title, tables) in SECTIONS.items():

@@ -1,11 +1,13 @@
 """The figures over training: their data against pandas and scipy, and what files they give."""
 
+import html
 import math
 import subprocess
 import sys
 from itertools import product
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +19,7 @@ from mace_rl.report.panels import MAX_POINTS, _thinned
 from mace_rl.results.figures import (
     Look,
     draw_figure,
+    figure_as_svg,
     mean_curves,
     quantity,
     save_figure,
@@ -137,12 +140,28 @@ def test_a_mean_that_covers_another_leaves_gaps_to_see_it_by():
         assert [line.get_linestyle() for line in lines] == expected
 
 
+# Of somebody's matplotlibrc.
+USERS = {"text.usetex": True, "font.size": 30, "font.family": "serif", "savefig.bbox": "tight"}
+USERS |= {"axes.formatter.use_locale": True, "path.simplify": False, "pdf.compression": 0}
+USERS |= {"axes.prop_cycle": matplotlib.cycler(color="r"), "axes.grid": True}
+
+
+def test_labels_are_plain_text(monkeypatch):
+    for label in ("$$", r"$\notacommand{$", r"$\lambda$ & <50 %> #~^{}", "long " * 12):
+        monkeypatch.setitem(LABELS, "ppo", label)
+        figure = draw()
+        assert f">{html.escape(label, quote=False)}<" in figure_as_svg(figure)
+        figure.draw_without_rendering()  # lays it out
+        assert figure.legends[0].get_window_extent().width < figure.bbox.width
+
+
 @pytest.mark.parametrize("kind", ["pdf", "png"])
 def test_the_same_data_gives_the_same_file_and_another_colour_does_not(tmp_path, monkeypatch, kind):
     contents = []
     for epoch, colours in (("0", COLOURS), ("1000000000", COLOURS), ("0", COLOURS | {"ppo": "k"})):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)  # what matplotlib would take for the time
-        save_figure(draw(colours=colours, episodes=200, inset=0.9), tmp_path / f"figure.{kind}")
+        with matplotlib.rc_context(USERS if epoch != "0" else {}):
+            save_figure(draw(colours=colours, episodes=200, inset=0.9), tmp_path / f"figure.{kind}")
         contents.append((tmp_path / f"figure.{kind}").read_bytes())
     assert contents[0] == contents[1] != contents[2]
     if kind == "pdf":  # vectors, and fonts that journals take

@@ -1,8 +1,12 @@
 """Runs that are kept come out as they went in."""
 
 import hashlib
+import io
 import json
+import lzma
+import re
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +146,75 @@ def test_a_sample_is_of_short_runs_of_different_archives(tmp_path: Path) -> None
     assert found.items() <= whole.items() and len(found) == 2 * 4
     with pytest.raises(ValueError, match="6 runs in it that take less than 60 s"):
         kept_runs.unpack_sample(tmp_path / "kept", tmp_path / "more", 7)
+
+
+def tar_of(members: list[tuple[str, bytes, bytes]]) -> bytes:
+    """An archive of (name, data, type)."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        for name, data, kind in members:
+            member = tarfile.TarInfo(name)
+            member.size, member.type, member.linkname = len(data), kind, "/etc/passwd"
+            tar.addfile(member, io.BytesIO(data))
+    return lzma.compress(buffer.getvalue())
+
+
+def with_record(episodes: str, seconds: str = "1", text: str = "") -> dict[str, bytes]:
+    whole = f'{{"seconds": {seconds}, "config": {{"episodes": {episodes}}}}}'
+    return {"seed1/run.json": (text or whole).encode()}
+
+
+HOSTILE = {  # members that are added or replaced, by what is said of them
+    "should not have '../../x'": {"../../x": b""},
+    "should not have '/tmp/x'": {"/tmp/x": b""},
+    "should not have 'seed1/../x/run.json'": {"seed1/../x/run.json": b"{}"},
+    "should not have 'seed1/agent.pt'": {"seed1/agent.pt": b""},
+    "should not have 'seed1/episodes.csv'": {"seed1/episodes.csv": b""},
+    "has -5 episodes": with_record("-5"),
+    "has 0 episodes": with_record("0"),
+    "has True episodes": with_record("true"),
+    "has 1000000000000 episodes, of which there are 30": with_record("1000000000000"),
+    "its runs have 29 episodes together": with_record("29"),
+    "list indices": with_record("", text="[]"),
+    "'config'": with_record("", text="{}"),
+    "has None seconds": with_record("30", "null"),
+    "recursion": with_record("", text="[" * 10**5),
+    "invalid literal": {"length": b"\n".join([b"1e9"] * 30)},
+    "larger than": {"length": bytes(kept_runs.EXPANDED)},
+}
+
+
+@pytest.mark.parametrize("said", HOSTILE)
+def test_what_was_never_packed_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str
+) -> None:
+    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    path = tmp_path / "kept/A-v1/ppo.tar.xz"
+    with tarfile.open(path) as tar:
+        members = {name: tar.extractfile(name).read() for name in tar.getnames()}
+    path.write_bytes(tar_of([(*one, b"0") for one in (members | HOSTILE[said]).items()]))
+    before = content(tmp_path)
+    for sample in ([], ["--sample", "1"]):
+        words = ["kept_runs", "unpack", str(path.parents[1]), str(tmp_path / "goal"), *sample]
+        monkeypatch.setattr("sys.argv", words)
+        with pytest.raises(SystemExit, match=rf"ppo\.tar\.xz .*{re.escape(said)}") as ended:
+            kept_runs.main()
+        assert "\n" not in str(ended.value.code)
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        *(tar_of([("seed1/run.json", b"", kind)]) for kind in (b"1", b"2", b"5", b"6", b"S")),
+        *(tar_of([("length", b"", b"0")] * 2), tar_of([("length", b"", b"0")])[:-9]),
+        *(lzma.compress(b"tar" * 999), b"no xz", b""),
+    ],
+)
+def test_links_and_damage_are_refused_by_the_file_s_name(tmp_path: Path, damage: bytes) -> None:
+    (tmp_path / "kept/A-v1").mkdir(parents=True)
+    (tmp_path / "kept/A-v1/ppo.tar.xz").write_bytes(damage)
+    with pytest.raises(ValueError, match=r"^[^\n]*ppo\.tar\.xz[^\n]*$"):
+        kept_runs.unpack(tmp_path / "kept", tmp_path / "goal")
+    assert not (tmp_path / "goal").exists()

@@ -29,7 +29,7 @@ def test_agent_is_torch_modules_that_act_as_the_trainer_does(
     box = environment == "Pendulum-v1"
     changes = merge(changes, {"episodes": 3, "ppo": {"normalise_observations": box}})
     config = run_config(environment, "mace_full", 0, **changes)
-    agent = load_agent(trained(environment, "mace_full", **changes))
+    agent = load_agent(trained(environment, "mace_full", **changes), trust=True)
     trainer, rng = finish(config), np.random.default_rng(0)
     space = trainer.environment.observation_space
     space.seed(0)

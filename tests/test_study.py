@@ -1,18 +1,24 @@
 """The study: merging of settings, and a clear refusal of every kind of mistake."""
 
 import copy
+import os
+import re
 import subprocess
 import sys
+import unicodedata
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 import yaml
+from matplotlib.colors import to_hex
+from matplotlib.ft2font import FT2Font
 
-from mace_rl.config.reading import read_yaml, typed
+from mace_rl.config.reading import _read, read_options, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
-from mace_rl.config.study import load_study, read_study
+from mace_rl.config.study import LABEL, load_study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 RULES = CONFIG.parent / "workflow" / "rules"
@@ -58,9 +64,12 @@ figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
 training: {ppo: {clip: high}}  # training, ppo.clip, 'high', number
-training: {ppo: {actor_learning_rate: 3e-4}}  # ppo.actor_learning_rate, '3e-4', write 0.0003
+training: {ppo: {actor_learning_rate: '3e-4'}}  # ppo.actor_learning_rate, '3e-4', write 0.0003
 environment_settings: {Acrobot-v1: {episodes: '60'}}  # Acrobot-v1, episodes, '60', write 60
 training: {episodes: 10.5}  # episodes, 10.5, integer
+training: {episodes: 1e3}  # episodes, 1000.0, integer (write 1000)
+training: {episodes: 1_000}  # episodes, '1_000', write 1000
+training: {ppo: {scale_rewards: no}}  # ppo.scale_rewards, 'no', write true or false
 training: {episodes: true}  # episodes, True, integer
 training: {episodes: -5}  # training, episodes, -5, greater than 0
 training: {ppo: {clip: .nan}}  # ppo.clip, nan, finite
@@ -93,9 +102,18 @@ environments: [CartPole-v1, CartPole-v1]  # environments, 'CartPole-v1' should b
 environments: []  # environments, [], at least 1
 variants: [ppo, mace_ful]  # variants, 'mace_ful', 'mace_full'
 variant_settings: {'{seed}': {beta: {kind: none}}}  # variant_settings, '{seed}', letters
+variant_settings: {'': {beta: {kind: none}}}  # variant_settings, '', letters
+variant_settings: {LONG: {beta: {kind: none}}}  # variant_settings, 'xxx, up to 200
+variant_settings: {0.1: {beta: {kind: none}}}  # variant_settings.0.1, text, quotes
+variants: [ppo, True]  # variants.1, True, text, quotes
 variant_settings: {mace_ful: {label: x}}  # variant_settings.mace_ful, beta, missing
 variant_settings: {ppo: {label: 3}}  # ppo.label, 3
 variant_settings: {ppo: {label: a}, mace_full: {label: a}}  # 2, label 'a', own
+variant_settings: {ppo: {label: _plain}}  # variant_settings.ppo.label, '_plain', without '_'
+variant_settings: {ppo: {label: "a\\nb"}}  # variant_settings.ppo.label, 'a\\nb', one line
+variant_settings: {ppo: {label: אב}}  # variant_settings.ppo.label, 'אב', Latin
+variant_settings: {ppo: {label: 🎉}}  # variant_settings.ppo.label, '🎉', Latin
+variant_settings: {ppo: {label: LONG}}  # variant_settings.ppo.label, 'xxx, 1 to 60
 variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluish', tab:blue
 variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
 variant_settings: {mace_fixed: {meta: {}}}  # mace_fixed, 'meta', 'exponential' does not use
@@ -108,6 +126,8 @@ environment_seeds: {HopperBulletEnvv0: [3]}  # environment_seeds, 'HopperBulletE
 metrics: {random_return: {CartPole-1: 4.0}}  # metrics.random_return, 'CartPole-1', 'CartPole-v1'
 metrics: {reference_return: {CartPole-1: 4.0}}  # reference_return, 'CartPole-1', 'CartPole-v1'
 results: 5  # results, 5, string
+results: 2024.10  # results, 2024.1, text, quotes
+results: LONG  # results, 'xxx, at most 255
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
 results: CONFIG/x  # results, CONFIG, is a file
@@ -116,9 +136,10 @@ results: CONFIG/x  # results, CONFIG, is a file
 
 @pytest.mark.parametrize("line", MISTAKES.strip().splitlines())
 def test_mistake_is_named_in_one_line(line: str) -> None:
-    change, _, expected = line.replace("CONFIG", str(CONFIG)).partition("  # ")
+    line = line.replace("CONFIG", str(CONFIG)).replace("LONG", 256 * "x")
+    change, _, expected = line.partition("  # ")
     with pytest.raises(ConfigError) as caught:
-        load_study(changed(yaml.safe_load(change)), "some.yaml")
+        load_study(changed(_read(change, "here")), "some.yaml")
     message = str(caught.value)
     assert message.startswith("some.yaml: ")
     assert "\n" not in message
@@ -175,7 +196,7 @@ def test_labels_and_colours_stand_with_the_variants() -> None:
     settings = {"variants": ["mine", "ppo"], "variant_settings": more}
     study = load_study(changed(settings), "test")
     assert study.labels == {"mine": "mine", "ppo": "PPO itself"}
-    assert study.colours["ppo"] == "k" and study.colours["mine"].startswith("C")
+    assert study.colours == {"mine": "tab:blue", "ppo": "k"}
     assert not {"label", "colour"} & set(study.run_config("CartPole-v1", "ppo", 0).settings())
 
 
@@ -193,6 +214,13 @@ def test_files_are_read_over_one_another(tmp_path: Path) -> None:
     overlay.write_text("seeds: []\n")
     with pytest.raises(ConfigError, match=r"config\.yaml \+ .*overlay\.yaml: seeds"):
         read_study([CONFIG, overlay])
+
+
+def laughs(form: str) -> bytes:
+    """Ten times ten times ten … values, in so many words."""
+    tens = (", ".join([f"*x{i}"] * 10) for i in range(8))
+    rest = (f"x{i}: &x{i} " + form.format(ten) for i, ten in enumerate(tens, 1))
+    return "\n".join(["x0: &x0 {a: 1}", *rest]).encode()
 
 
 FILES = sorted(path.name for path in (CONFIG.parent / "config").glob("*.yaml"))
@@ -217,6 +245,14 @@ def test_every_study_of_the_project_can_be_carried_out(name: str) -> None:
         (b"a: \xff\n", "not UTF-8"),
         (b"a: 1\nb: {c: 1, c: 2}\n", "line 2, column 11: .*'c' occurs twice"),
         (b"a: \x07\n", "not valid YAML"),
+        (b"a: " + 2000 * b"[", "line 1, column 53: .*more than 50 levels"),
+        (b"? {a: b}\n", "line 1, column 3: .*a key that is a list or mapping"),
+        (b"a: &a [*a]", "line 1, column 8: .*aliases"),
+        (b"a: &a {<<: *a}", "line 1, column 12: .*aliases"),
+        (laughs("[{}]"), "line 6, column .*aliases"),
+        (laughs("{{<<: [{}]}}"), "line 6, column .*aliases"),
+        (b"a: !!set {b}", "the tag 'tag:yaml.org,2002:set'"),
+        (b"{<<: {a: 1}, <<: {b: 1}}", "'<<' occurs twice"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path: Path, text: bytes | None, expected: str) -> None:
@@ -229,29 +265,59 @@ def test_files_that_cannot_be_used(tmp_path: Path, text: bytes | None, expected:
     assert "\n" not in str(caught.value)
 
 
+TEXTS = ["2024_11_25", "2024-11-25", "12:30", "~/x", "NA", "None", "no", "y", "007", "0o17", "0x1F"]
+
+
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        (["0", "1"], [0, 1]),  # --config seeds=[0,1]
-        (
-            {"ppo": {"clip": "0.5", "minibatch_size": "null"}},
-            {"ppo": {"clip": 0.5, "minibatch_size": None}},
-        ),
-        (["ppo"], ["ppo"]),
-        ("7", "7"),  # Snakemake itself tells 7 from '7' here
-        (3, 3),
+        ("[0,1]", [0, 1]),
+        ("{a: {b: 5e-1, c: +3, d: null}}", {"a": {"b": 0.5, "c": 3, "d": None}}),
+        ("[ppo, 'true', true, TRUE, ~]", ["ppo", "true", True, True, None]),
+        ("'7'", "7"),
+        ("", None),
+        ("[&a {p: 1, q: 1}, &b {<<: *a, q: 2}, *b]", [{"p": 1, "q": 1}, *[{"p": 1, "q": 2}] * 2]),
+        ("{<<: [{a: 1}, {a: 2, b: 2}, {b: 3, c: 3}], c: 4}", {"a": 1, "b": 2, "c": 4}),
+        *((text, text) for text in TEXTS),
+        (f"[{', '.join(TEXTS)}]", TEXTS),
     ],
 )
-def test_numbers_from_the_command_line(given: Any, expected: Any) -> None:
-    assert typed(given) == expected
+def test_a_value_is_what_was_typed(tmp_path: Path, given: str, expected: Any) -> None:
+    """On the command line as in a file."""
+    assert read_options([f"key={given}"]) == {"key": expected}
+    (tmp_path / "file.yaml").write_text(f"key: {given}", encoding="utf-8")
+    assert read_yaml(tmp_path / "file.yaml") == {"key": expected}
+
+
+def test_options_go_over_one_another_and_have_no_comments() -> None:
+    assert read_options(["a={b: 1, c: 2}", "a={c: 3}"]) == {"a": {"b": 1, "c": 3}}
+    assert read_options(["results=a #b"]) == {"results": "a #b"}
+
+
+def test_labels_have_what_the_figures_font_has() -> None:
+    font = FT2Font(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf")
+    letters = filter(str.isprintable, map(chr, range(0x20000)))
+    taken = [letter for letter in letters if re.fullmatch(LABEL, letter)]
+    assert {*"aβ₀$\\%~Ж"} < set(taken) and all(font.get_char_index(ord(one)) for one in taken)
+    assert not {"R", "AL"} & set(map(unicodedata.bidirectional, taken))
+
+
+def test_every_variant_has_a_colour_of_its_own() -> None:
+    own = {f"v{place}": {"beta": {"kind": "none"}} for place in range(60)}
+    own["v7"] |= {"colour": "#7f7f7f"}  # tab:gray, which is then not another's
+    study = load_study(changed({"variants": list(own), "variant_settings": own}), "test")
+    colours = list(study.colours.values())
+    assert len(set(map(to_hex, colours))) == 60
+    assert colours[:2] == ["tab:brown", "tab:pink"]  # those before are others'
 
 
 def test_planning_imports_nothing_slow() -> None:
     """Whatever of this project the rules import."""
     rules = [line for rule in RULES.glob("*.smk") for line in rule.read_text("utf-8").splitlines()]
     code = [line for line in rules if line.startswith(("from ", "import ")) and "mace_rl" in line]
-    code = "\n".join([*code, "import sys; print(*sys.modules)"])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = "\n".join([*code, "import matplotlib.colors, sys; print(*sys.modules)"])
+    command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": "of a notebook"}
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert "mace_rl.config.study" in loaded
     assert not loaded & {"torch", "numba", "pandas", "scipy.stats", "matplotlib.pyplot", "pybullet"}

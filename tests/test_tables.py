@@ -24,8 +24,8 @@ from mace_rl.results.aggregate import aggregate
 from mace_rl.results.claims import ledger
 from mace_rl.results.comparisons import comparisons
 from mace_rl.results.latex import table1_latex, table2_latex
-from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.pages import tables_page
+from mace_rl.results.metrics import Metric, all_metrics, metrics_columns
+from mace_rl.results.pages import read_data, tables_page
 from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1, VARIANTS
 from mace_rl.results.protocol import FAMILIES, LITERAL, ROBUST
 from mace_rl.results.renderings import (
@@ -291,6 +291,19 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     assert run.returncode == 0, run.stdout
     for trouble in ("Overfull \\hbox", "Float too large", "Missing character"):
         assert trouble not in run.stdout
+
+
+def test_names_are_read_as_they_were_written(tmp_path: Path) -> None:
+    runs = metrics(["CartPole-v1"], ["NA", "None", "nan", "0.1", "1e3", "True", "007"])
+    runs = runs.astype(metrics_columns(all_metrics(SETTINGS)))
+    pairs = SETTINGS.model_copy(update={"comparisons": [["NA", "0.1"]]})
+    made = {"metrics": runs, "table1": table1(runs), "comparisons": comparisons(runs, pairs)}
+    for name, frame in made.items():
+        frame.to_csv(tmp_path / f"{name}.csv", index=False)
+    of_runs = runs[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
+    read, _ = read_data({name: tmp_path / f"{name}.csv" for name in made}, list(of_runs), SETTINGS)
+    for name, frame in made.items():
+        pd.testing.assert_frame_equal(read[name], frame.reset_index(drop=True), check_dtype=False)
 
 
 def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_files() -> None:

@@ -56,7 +56,7 @@ def test_a_sample_is_as_large_as_asked_and_always_the_same(tmp_path, monkeypatch
     def drawn(sample: int | None) -> list[str]:
         return [*verify.verify(tmp_path, sample)][:-1]
 
-    monkeypatch.setattr(verify, "repeat", lambda folder: (True, str(folder)))
+    monkeypatch.setattr(verify, "repeat", lambda folder, trust: (True, str(folder)))
     assert drawn(None) == drawn(99) == [*map(str, folders)]
     assert drawn(3) == drawn(3) == sorted({*drawn(3)} & {*drawn(None)}) and len(drawn(3)) == 3
 

@@ -17,6 +17,7 @@ import itertools
 import json
 import lzma
 import os
+import re
 import sys
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
@@ -32,24 +33,51 @@ from mace_rl.runs.provenance import file_digest, read_record
 
 AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
 LONGEST = 60  # seconds of a run in a sample
+# What an archive expands to at most, and the memory that this may take, bytes. Ours have 8 MB.
+EXPANDED, MEMORY = 1 << 26, 1 << 27
 COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episode", "env_steps")]
+MEMBERS = re.compile(
+    "|".join([*COLUMNS, f"seed[0-9]{{1,10}}/{files.RECORD}", f"{AT_PLAY}/{files.AGENT}"])
+)
+DAMAGE = (tarfile.TarError, lzma.LZMAError, OSError, EOFError)
 
 
 def read(archive: Path) -> dict[str, bytes]:
-    """What is in an archive, by name."""
+    """What is in an archive, by name; `ValueError` with its path for what `write` never wrote."""
+    try:
+        return _read(archive.read_bytes())
+    except (*DAMAGE, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"{archive} is not as a packed one is: {error}") from None
+
+
+def _read(compressed: bytes) -> dict[str, bytes]:
     # Decompressed at once: tarfile's own way takes twice as long.
-    content = lzma.decompress(archive.read_bytes())
-    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
-        members = ((member.name, tar.extractfile(member)) for member in tar.getmembers())
-        found = {name: file.read() for name, file in members if file is not None}
+    decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MEMORY)
+    content = decompressor.decompress(compressed, EXPANDED)
+    if not decompressor.eof:
+        raise ValueError(f"cut off, or larger than {EXPANDED} bytes when expanded")
+    found: dict[str, bytes] = {}
+    with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
+        for member in tar:
+            plain = member.type == tarfile.REGTYPE and not member.issparse()
+            file = tar.extractfile(member) if plain else None
+            if not file or member.name in found or not MEMBERS.fullmatch(member.name):
+                raise ValueError(f"it should not have {member.name[:60]!r}, or not as it does")
+            found[member.name] = file.read()
     columns = {name: found.pop(name).decode().splitlines() for name in COLUMNS}
-    seeds = [name for name in found if name.endswith(files.RECORD)]
     start = 0
-    for name in seeds:
-        end = start + json.loads(found[name])["config"]["episodes"]
-        own = {column: values[start:end] for column, values in columns.items()}
+    for name in [name for name in found if name.endswith(files.RECORD)]:
+        record, left = json.loads(found[name]), len(columns["length"]) - start
+        episodes, seconds = record["config"]["episodes"], record["seconds"]
+        if type(episodes) is not int or not 0 < episodes <= left:
+            raise ValueError(f"{name} has {episodes!r} episodes, of which there are {left}")
+        if not isinstance(seconds, int | float):
+            raise ValueError(f"{name} has {seconds!r} seconds")
+        own = {column: values[start : start + episodes] for column, values in columns.items()}
         found[name.replace(files.RECORD, files.EPISODES)] = _together(own)
-        start = end
+        start += episodes
+    if not start or any(len(values) != start for values in columns.values()):
+        raise ValueError(f"its runs have {start} episodes together, but its columns others")
     return found
 
 
@@ -75,6 +103,8 @@ def write(archive: Path, content: dict[str, bytes]) -> None:
             member = tarfile.TarInfo(name)
             member.size = len(data)
             tar.addfile(member, io.BytesIO(data))
+    if buffer.tell() > EXPANDED:
+        raise ValueError(f"{archive}: more than {EXPANDED} bytes, which would not be unpacked")
     archive.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(archive, lzma.compress(buffer.getvalue(), preset=9 | lzma.PRESET_EXTREME))
 
@@ -186,7 +216,7 @@ def main() -> None:
             raise ValueError("--sample is a number of runs to unpack, at least 1")
         else:
             count = unpack_sample(arguments.origin, arguments.goal, arguments.sample)
-    except (ValueError, OSError, tarfile.TarError, lzma.LZMAError) as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"kept_runs: {error}")
     print(f"{count} runs in {arguments.goal}")
 

@@ -90,6 +90,7 @@ def parser() -> argparse.ArgumentParser:
             action="store_true",
             help="take the most probable action, or the mean, instead of a sample",
         )
+        add("--trust", action="store_true", help="import code that run.json names")
     add("--untrained", action="store_true", help="film the agent as it was before training")
     add("--seconds", type=float, default=10.0, help="of each episode at most (default: 10)")
     add("--width", type=int, default=300, help="in pixels (default: 300)")
@@ -119,6 +120,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
     add("--sample", type=int, help="how many, always the same ones (default: all)")
+    add("--trust", action="store_true", help="import code that run.json names")
     return top
 
 
@@ -180,7 +182,8 @@ def evaluate(arguments: argparse.Namespace) -> None:
     from mace_rl.runs import evaluate
 
     returns = evaluate.evaluate(
-        arguments.folder, arguments.episodes, arguments.seed, arguments.deterministic
+        *(arguments.folder, arguments.episodes, arguments.seed),
+        *(arguments.deterministic, arguments.trust),
     )
     print(
         f"{len(returns)} episodes: mean return {returns.mean():.2f}, standard deviation "
@@ -204,6 +207,7 @@ def watch(arguments: argparse.Namespace) -> None:
         arguments.seed,
         deterministic=arguments.deterministic,
         untrained=arguments.untrained,
+        trust=arguments.trust,
         width=arguments.width,
         seconds=arguments.seconds,
     )
@@ -239,7 +243,7 @@ def verify(arguments: argparse.Namespace) -> None:
     _require(sample is None or sample >= 1, "--sample", sample, "be at least 1")
     from mace_rl.runs import verify
 
-    for line in verify.verify(arguments.folder, sample):
+    for line in verify.verify(arguments.folder, sample, arguments.trust):
         print(line, flush=True)
 
 
@@ -258,7 +262,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         commands[arguments.command](arguments)
-    except (Refusal, OSError) as error:
+    except (Refusal, OSError, MemoryError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except ModuleNotFoundError as error:
         if (

@@ -69,7 +69,7 @@ def beta_rule(
         case ExponentialBeta():
             return ExponentialSchedule(settings)
         case CustomBeta(rule=rule, arguments=arguments):
-            return make(rule, "beta.rule", generator, **arguments)
+            return make(rule, "beta.rule", BetaController, False, generator, **arguments)
 
 
 def intrinsic_reward(
@@ -91,7 +91,8 @@ def intrinsic_reward(
         case HashCountsBonus():
             return HashCounts(config.bonus, space, size, generator)
         case CustomBonus(estimator=estimator, arguments=arguments):
-            return make(estimator, "bonus.estimator", size, actions, generator, **arguments)
+            key, own = "bonus.estimator", (size, actions, generator)
+            return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 
 def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:

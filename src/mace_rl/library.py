@@ -82,4 +82,4 @@ def train(
         directory = Path(folder or scratch)
         if not finished(settings, directory):
             run(settings, directory, after_episode=callback)
-        return Trained(load_agent(directory), read_rows(directory / files.EPISODES))
+        return Trained(load_agent(directory, trust=True), read_rows(directory / files.EPISODES))

@@ -5,7 +5,8 @@ What trains compiled networks gives the same bits on every processor by construc
 whose sums differ in the last bit: NumPy and OpenBLAS where tables and figures are made and where
 Hopper turns a vector, PyTorch where a network is a torch module of one's own. They can be told
 otherwise by variables that each reads once. Importing this module sets them, before any of these
-libraries is loaded: the commands and the workflow do; `import mace_rl` alone does not.
+libraries is loaded, and Matplotlib's backend: the commands and the workflow do; `import mace_rl`
+alone does not.
 """
 
 import os
@@ -34,4 +35,5 @@ def pin() -> None:
         os.environ.update(PINS)
 
 
+os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a notebook's backend need not be here
 pin()

@@ -36,6 +36,7 @@ rule page:
         command=COMMAND,
         configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
         ppo=ppo_settings(),
+        own=own_code(),
         template=provenance.file_digest(PACKAGE / "report" / "page.html"),
         code=code("report.py", MEASURED),
     script:

@@ -6,13 +6,14 @@ import os
 import re
 import shlex
 import sys
+from functools import reduce
 from pathlib import Path
 
 from mace_rl import files
-from mace_rl.config.reading import merge, read_yaml, typed
+from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import folder_of, load_study
-from mace_rl.config.plugins import source_file
+from mace_rl.config.plugins import code_outside, source_file
 from mace_rl.environments import registered
 from mace_rl.results import paper, protocol
 from mace_rl.results.metrics import all_metrics
@@ -26,11 +27,11 @@ try:
     paths = [os.path.relpath(file) for file in workflow.configfiles]
     config_files = paths[-1:] + paths[:-1]  # Snakemake lists its own config.yaml last
     origin = " + ".join(config_files)
-    for file in paths:
-        read_yaml(Path(file))  # sees what Snakemake's reader does not: a key that occurs twice
-    # Snakemake takes the numbers in `--config seeds=[0,1]` for text.
-    given = {key: typed(value) for key, value in workflow.config_settings.config.items()}
-    study = load_study(merge(config, given), origin)
+    # Files and options are read again: Snakemake makes 20241125 of `--config results=2024_11_25`.
+    options = workflow.config_settings.config_args
+    replaced = workflow.config_settings.replace_workflow_config  # then the first is left out
+    layers = [*(read_yaml(Path(file)) for file in config_files[replaced:]), read_options(options)]
+    study = load_study(reduce(merge, layers), origin)
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {error}")
 try:
@@ -57,12 +58,10 @@ PICTURES += ["constants"] if MEASURED.constants else []
 PICTURES += ["solved"] if MEASURED.solved_return else []
 PICTURES += ["forest"] if CLAIMS else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
-GIVEN = {key: value for key, value in given.items() if key != "results"}
+GIVEN = [option for option in options if not option.startswith("results=")]
 COMMAND = ["snakemake", "all"]
 COMMAND += ["--configfile", *config_files[1:]] if config_files[1:] else []
-COMMAND += (
-    ["--config", *(f"{key}={json.dumps(value)}" for key, value in GIVEN.items())] if GIVEN else []
-)
+COMMAND += ["--config", *GIVEN] if GIVEN else []
 COMMAND = shlex.join(COMMAND)
 TRAININGS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # with how many episodes
 
@@ -92,6 +91,13 @@ def ppo_settings():
         others = {name: settings for name, settings in own.items() if settings != found[env]}
         found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
     return found
+
+
+def own_code():
+    """The settings of the runs whose agents are shown, where these name the user's own code."""
+    first = {run[:2]: study.run_config(*run) for run in reversed(RUNS)}  # of its seeds
+    shown = [config.settings() for config in first.values()]
+    return [settings for settings in shown if code_outside(settings)]
 
 
 def most_work(wildcards):

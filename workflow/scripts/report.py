@@ -27,7 +27,7 @@ with job("the report", snakemake.log[0]):
         ppo={env: PPOConfig.model_validate(values) for env, values in params.ppo.items()},
         records=list(map(read_record, records)),
     )
-    films = animations(first, params.labels, Path(snakemake.output[0]).parent)
+    films = animations(first, params.labels, Path(snakemake.output[0]).parent, params.own)
     look = Look(FigureConfig(columns=3), settings.confidence, params.labels, params.colours)
     html = page(data, claims, making, films, settings, look)
     write_atomically(snakemake.output[0], html)

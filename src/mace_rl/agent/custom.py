@@ -22,9 +22,11 @@ def custom_module(
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(generator.integers(2**63)))
-        module: torch.nn.Module = make(
+        module = make(
             settings.module,
             "ppo.network.module",
+            torch.nn.Module,
+            True,
             *(inputs, outputs, hidden_units),
             **settings.arguments,
         )

@@ -72,8 +72,8 @@ def novelty(
         case "density" if isinstance(space, Box):
             return DensityNovelty(config, normaliser, streams)
         case "custom" if config.estimator is not None:
-            given = size, streams["novelty"]
-            return make(config.estimator, "novelty.estimator", *given, **config.arguments)
+            key, given = "novelty.estimator", (size, streams["novelty"])
+            return make(config.estimator, key, Novelty, False, *given, **config.arguments)
     raise ConfigError(
         f"novelty.kind is {kind!r}, but the observations are {space}: 'counts' is for Discrete"
         " ones, 'density' for Box"

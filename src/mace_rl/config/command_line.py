@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from mace_rl.config.reading import read_yaml
+from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.config.section import ConfigError
 
 
@@ -14,11 +14,12 @@ def checked() -> argparse.Namespace:
     parser.add_argument("--cores", "-c", nargs="?", const="all")
     parser.add_argument("--jobs", "-j", nargs="?", const="all")
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", default=[])
-    parser.add_argument("--config", "-C", nargs="*", action="append")  # not short for --configfile
+    parser.add_argument("--config", "-C", nargs="*", default=[])  # not short for --configfile
     given, _ = parser.parse_known_args()
     try:
-        for file in given.configfile:
+        for file in [*Path().glob("config.yaml"), *given.configfile]:
             read_yaml(Path(file))
+        read_options(given.config)
         if given.cores and given.jobs and given.cores != given.jobs:
             raise ConfigError(
                 f"-j {given.jobs} and --cores {given.cores} contradict each other: give one of them"

@@ -1,19 +1,57 @@
 """Code of the user's own that the configuration names as "package.module:Name".
 
 Modules are looked for where Python finds them and, after that, in the folder that the command is
-given in.
+given in. Whoever writes a configuration decides what it names. A `run.json` may come from somebody
+else: what it names from outside this package is imported only by leave.
 """
 
 import importlib
 import importlib.util
 import inspect
 import os
+import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.config.section import ConfigError
+from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError, check, short
+
+
+def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
+    """The configuration in a `run.json` or the like, which `origin` names.
+
+    Raises `ConfigError` if it cannot be used and, unless `trust`, if it names code from outside
+    this package; none of that has been imported then.
+    """
+    config = check(RunConfig, values, origin)
+    for key, text in ({} if trust else code_outside(values)).items():
+        raise ConfigError(
+            f"{origin}: {key} has {short(text)}, code from outside mace_rl: if you trust it, give "
+            "--trust (in a program: trust=True)"
+        )
+    return config
+
+
+def code_outside(settings: Any) -> dict[str, str]:
+    """By key, what can name code from outside this package, in plain settings at any depth.
+
+    That is every text with a ':', as in "package.module:Name" and in the ids of environments, also
+    among arguments, which may get it imported as well.
+    """
+    found, waiting = {}, [("", settings)]
+    while waiting:
+        key, value = waiting.pop()
+        if isinstance(value, Mapping):
+            waiting += [(f"{key}.{name}".lstrip("."), part) for name, part in value.items()]
+            waiting += [(key, name) for name in value]
+        elif isinstance(value, list | tuple):
+            waiting += [(key, part) for part in value]
+        elif isinstance(value, str) and re.match(r"(?!mace_rl[.:]).*:", value, re.DOTALL):
+            found[key] = value
+    return found
 
 
 def load(reference: str, key: str) -> Any:
@@ -25,9 +63,25 @@ def load(reference: str, key: str) -> Any:
     return getattr(module, name)
 
 
-def make(reference: str, key: str, *given: Any, **arguments: Any) -> Any:
-    """What "package.module:Name" returns; `ConfigError` if it does not take these arguments."""
-    factory = load(reference, key)
+def make(
+    reference: str, key: str, kind: type, functions: bool, /, *given: Any, **arguments: Any
+) -> Any:
+    """What the class "package.module:Name" makes, called with what is `given` and the `arguments`.
+
+    It has to be a subclass of `kind`; with `functions` also a function that returns a `kind`, but
+    none of Python's or of this package. `ConfigError` for what is neither, before it is called, and
+    for what does not take these arguments.
+    """
+    factory: Any = load(reference, key)
+    if isinstance(factory, FunctionType):
+        package = str(factory.__module__).partition(".")[0]
+        fits = functions and package not in (*sys.stdlib_module_names, "mace_rl")
+    else:
+        fits = isinstance(factory, type) and issubclass(factory, kind)
+    if not fits:
+        wanted = f"a subclass of {kind.__module__}.{kind.__name__}"
+        wanted += ", or a function of your own that returns one" if functions else ""
+        raise ConfigError(f"{key} has {reference!r}, but it should name {wanted}")
     try:
         inspect.signature(factory).bind(*given, **arguments)
     except TypeError as error:
@@ -38,8 +92,11 @@ def make(reference: str, key: str, *given: Any, **arguments: Any) -> Any:
 def import_module(reference: str, key: str) -> ModuleType:
     """The module in "package.module:Name", imported; `ConfigError` if it cannot be."""
     _look_here_too()
+    module = reference.partition(":")[0]
     try:
-        return importlib.import_module(reference.partition(":")[0])
+        if not all(part.isidentifier() for part in module.split(".")):
+            raise ImportError(f"{module!r} is no module's name")
+        return importlib.import_module(module)
     except ImportError as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
@@ -51,7 +108,7 @@ def source_file(reference: str, key: str) -> Path:
     module = reference.partition(":")[0]
     try:
         spec = importlib.util.find_spec(module)
-    except ImportError:
+    except (ImportError, ValueError):  # the latter for __main__
         spec = None
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         raise ConfigError(

@@ -1,6 +1,7 @@
-"""Reading YAML files, and reading one over another."""
+"""Reading YAML, of files and of the command line, and reading one over another."""
 
-from collections.abc import Collection, Hashable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,26 @@ DEFAULTS = Path(__file__).with_name("defaults.yaml").resolve()
 def read_yaml(path: Path) -> Settings:
     """The mapping in a YAML file; `ConfigError` if there is none or a key occurs twice."""
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys)
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise ConfigError(f"{path}{place}: not valid YAML: {error.problem}") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    values = _read(text, str(path))
     if not isinstance(values, dict):
         found = "empty" if values is None else short(values)
         raise ConfigError(f"{path}: it is {found}, but should be keys with values")
     return values
+
+
+def read_options(options: Iterable[str]) -> Settings:
+    """What `--config KEY=VALUE ...` says; values are read as in a file, and texts stay as typed."""
+    settings: Settings = {}
+    for option in options:
+        key, _, text = option.partition("=")
+        value = _read(text, f"--config {key}")
+        plain = isinstance(value, str) and text.lstrip()[0] not in "\"'"
+        settings = merge(settings, {key: text if plain else value})
+    return settings
 
 
 def merge(
@@ -61,27 +68,68 @@ def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
     return merge(base, over, whole={"beta"} if same else {"beta", "bonus"})
 
 
-def typed(value: Any) -> Any:
-    """`value` with the texts inside its mappings and lists read as YAML: ["0"] becomes [0]."""
+def _read(text: str, origin: str) -> Any:
+    """The value of a YAML text; a `ConfigError` with the place of the first mistake."""
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ConfigError(f"{origin}{place}: not valid YAML: {problem}") from None
 
-    def read(item: Any) -> Any:
-        return yaml.safe_load(item) if isinstance(item, str) else typed(item)
 
-    if isinstance(value, Mapping):
-        return {key: read(item) for key, item in value.items()}
-    return [read(item) for item in value] if isinstance(value, list) else value
+DEEPEST, MOST = 50, 100_000  # levels of nesting, and values for which aliases stand
+
+# What is no text. To YAML 1.1 no, 1_000, 012, 1:30 and dates would be something else, too.
+_SCALARS = [
+    (f"tag:yaml.org,2002:{name}", re.compile(rf"({pattern})\Z", re.ASCII))
+    for name, pattern in (
+        ("null", r"~|null|Null|NULL|"),
+        ("bool", r"true|True|TRUE|false|False|FALSE"),
+        ("int", r"[-+]?(0|[1-9]\d{0,99})"),
+        ("float", r"[-+]?(?=.*[.eE])((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?"),
+        ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"),
+        ("merge", "<<"),
+    )
+]
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML's safe loader; a key that occurs twice in a mapping is an error."""
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, with the scalars of YAML 1.2; whatever stands for more is an error.
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key {key!r} occurs twice", problem_mark=key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+    That is: a key that occurs twice, a list or mapping as a key, a tag, and what is without end or
+    measure by its depth or its aliases.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self.yaml_implicit_resolvers = {None: _SCALARS}  # whatever the first character
+        self.depth = self.count = 0
+        self.sizes: dict[yaml.Node | None, int] = {}  # values in what is read to its end
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event, before = self.peek_event(), self.count  # type: ignore[no-untyped-call]
+        alias, tag = isinstance(event, yaml.AliasEvent), getattr(event, "tag", None)
+        self.depth, self.count = self.depth + 1, self.count + 1
+        _refuse(self.depth > DEEPEST, f"more than {DEEPEST} levels", event)
+        _refuse(tag is not None, f"the tag {tag!r}", event)
+        node = super().compose_node(parent, index)
+        self.count += self.sizes.get(node, MOST) if alias else 0  # MOST: of what it stands in
+        _refuse(alias and self.count > MOST, "aliases that stand for too much", event)
+        self.sizes.setdefault(node, self.count - before)
+        self.depth -= 1
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node, seen = super().compose_mapping_node(anchor), set()
+        for key, _ in node.value:
+            _refuse(not isinstance(key, yaml.ScalarNode), "a key that is a list or mapping", key)
+            _refuse((key.tag, key.value) in seen, f"the key {key.value!r} occurs twice", key)
+            seen.add((key.tag, key.value))
+        return node
+
+
+def _refuse(wrong: bool, problem: str, where: Any) -> None:
+    if wrong:
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=where.start_mark)

@@ -6,6 +6,7 @@ import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from mace_rl.refusal import Refusal
 
@@ -62,7 +63,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case _:
             reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
             reason = " ".join(reason.replace(" after validation, not 0", "").split())
-            return f"{key} is {short(problem['input'])}, but {reason}{_advice(problem['input'])}"
+            return f"{key} is {short(problem['input'])}, but {reason}{_advice(problem)}"
 
 
 def short(value: Any) -> str:
@@ -71,11 +72,19 @@ def short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _advice(value: Any) -> str:
-    """For numbers that YAML takes for text."""
-    if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", value):
-        number = int(value) if re.fullmatch(r"[-+]?\d+", value) else float(value)
-        return f" (YAML takes it for text: write {number!r}, without quotes)"
+def _advice(problem: ErrorDetails) -> str:
+    """For what YAML takes for something else than is meant."""
+    wanted, value = problem["type"], problem["input"]
+    if wanted == "string_type" and isinstance(value, bool | int | float):
+        return " (YAML takes it for text where it stands in quotes)"
+    if wanted == "bool_type" and isinstance(value, str):
+        return " (write true or false)"
+    text = str(value).replace("_", "")
+    if re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text):
+        number = float(text)
+        if wanted == "float_type" or (wanted == "int_type" and number.is_integer()):
+            quotes = ", without quotes" if isinstance(value, str) else ""
+            return f" (write {short(int(number) if number.is_integer() else number)}{quotes})"
     return ""
 
 

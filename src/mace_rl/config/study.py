@@ -10,6 +10,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from colorsys import hsv_to_rgb
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
@@ -28,21 +29,24 @@ from mace_rl.environments import registered
 # Environments and variants name folders and appear in Snakemake's patterns. An environment may have
 # more, as in Gymnasium: package.module:Namespace/Id.
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+# What the figures' font has; Matplotlib leaves out of legends what begins with '_'.
+LABEL = r"(?![_ ])[ -\u02af\u0370-\u037e\u0384-\u0525\u2010-\u20b5\u2190-\u22ff]{1,60}(?<! )"
 
 
-def _colour(name: str) -> str:
-    try:
-        from matplotlib.colors import is_color_like
-    except ImportError:
-        return name  # nothing is drawn without
-    if not is_color_like(name):
-        raise ValueError("it should be a colour of Matplotlib's, such as tab:blue or '#1f77b4'")
-    return name
+def _label(text: str) -> str:
+    if not (text.isprintable() and re.fullmatch(LABEL, text)):
+        raise ValueError(
+            "it should be 1 to 60 Latin, Greek or Cyrillic letters, digits and signs on one line,"
+            " without '_' before and spaces around them"
+        )
+    return text
 
 
 def _folder(path: str) -> str:
     if not path.strip() or re.search(r"[{}\n\r\0*?\[\]]", path):
         raise ValueError("it should be the path of a folder, without {}*?[]")
+    if max(map(len, path.encode().split(b"/"))) > 255:
+        raise ValueError("its names should be of at most 255 bytes")
     for part in (Path(path), *Path(path).parents):
         if part.exists() and not part.is_dir():
             raise ValueError(f"it should be a folder, and {part} is a file")
@@ -64,8 +68,8 @@ class Variant(Section):
 
     model_config = Section.model_config | {"extra": "allow"}
 
-    label: str | None = None  # in tables and figures; None: its name
-    colour: Annotated[str, AfterValidator(_colour)] | None = None  # None: Matplotlib's next
+    label: Annotated[str, AfterValidator(_label)] | None = None  # as plain text; None: its name
+    colour: str | None = None  # one of Matplotlib's; None: one that no other variant has
 
     @property
     def settings(self) -> Settings:
@@ -114,9 +118,16 @@ class Study(Section):
 
     @property
     def colours(self) -> dict[str, str]:
-        """The colours of the study's variants."""
-        places = {name: f"C{place}" for place, name in enumerate(self.variant_settings)}
-        return {name: self.variant_settings[name].colour or places[name] for name in self.variants}
+        """The colours of the study's variants: their own, Matplotlib's ten, then hues far apart."""
+        from matplotlib.colors import TABLEAU_COLORS, to_hex
+
+        hues = (hsv_to_rgb(0.618 * n % 1, 1, (0.4, 0.7, 1)[n % 3]) for n in itertools.count())
+        given = {name: variant.colour for name, variant in self.variant_settings.items()}
+        taken = set(map(to_hex, filter(None, given.values())))
+        every = itertools.chain(TABLEAU_COLORS, map(to_hex, hues))
+        free = (colour for colour in every if to_hex(colour) not in taken)
+        colours = {name: colour or next(free) for name, colour in given.items()}
+        return {name: colours[name] for name in self.variants}
 
     def run_config(
         self, environment: str, variant: str, seed: int, changes: Settings | None = None
@@ -142,12 +153,20 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     `origin` (file names) starts the message of the `ConfigError`, one line with the key, the value
     and what would be right, that the first mistake raises.
     """
+    from matplotlib.colors import is_color_like
+
     study = check(Study, {str(key): value for key, value in config.items()}, origin)
     try:
         for variant in study.variants:
             _check_known(variant, study.variant_settings, "variants", "variant_settings")
         for variant in study.variant_settings:
             _check_name(variant, "variant_settings")
+        for variant, shown in study.variant_settings.items():
+            if shown.colour is not None and not is_color_like(shown.colour):
+                raise ConfigError(
+                    f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"
+                    " of Matplotlib's, such as tab:blue or '#1f77b4'"
+                )
         [(label, count)] = Counter(study.labels.values()).most_common(1)
         if count > 1:
             raise ConfigError(
@@ -246,10 +265,10 @@ def _depth(layer: Any, location: Iterable[Any]) -> int:
 
 def _check_name(environment: str, key: str) -> None:
     extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
-    if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment):
+    if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment) or len(environment) > 200:
         raise ConfigError(
-            f"{key} has {environment!r}, but a name here becomes a folder: it should consist of "
-            "letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
+            f"{key} has {short(environment)}, but a name here becomes a folder: it should be up to "
+            "200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
             "environment's may stand a module and ':', then a namespace and '/'"
         )
 

@@ -80,6 +80,7 @@ class Environment(Spaces):
                 raise ConfigError(
                     f"environment {name!r} needs a package that should be installed: {reason}"
                 ) from None
+        self.given_space = self.env.observation_space  # that of what it gives, before `encode`
         if isinstance(self.env.observation_space, Tuple | Dict):
             self.env = FlattenObservation(self.env)
         super().__init__(name, self.env.observation_space, self.env.action_space)

@@ -5,6 +5,7 @@ this package gets a folder to itself, set while a function of ours is decorated 
 else is compiled in this process, a program of somebody's, has its cache where it had it.
 """
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,9 @@ from mace_rl.sources import PACKAGE, digest
 
 config: Any = numba.config  # which it fills as it is imported
 # Where this cannot be written, numba takes the user's folder for caches.
-FOLDER = Path(config.CACHE_DIR or PACKAGE / "__pycache__" / "numba") / digest("everything")[:16]
+# Not config.CACHE_DIR, which a .numba_config.yaml in the current folder sets: what is there is run.
+FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__" / "numba")
+FOLDER /= digest("everything")[:16]
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -2,11 +2,12 @@
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from mace_rl import files
+from mace_rl.runs.provenance import read_record
 from mace_rl.runs.watch import Film, RenderError, film, gif
 
 WIDTH, SECONDS = 200, 5.0  # a film of Hopper's then takes less than 400 kB
@@ -25,13 +26,17 @@ class Animation:
 
 
 def animations(
-    runs: Mapping[tuple[str, str], Path], labels: Mapping[str, str], origin: Path
+    runs: Mapping[tuple[str, str], Path],
+    labels: Mapping[str, str],
+    origin: Path,
+    own: Collection[object] = (),
 ) -> tuple[dict[str, list[Animation]], list[str]]:
     """Films of one run of each environment and variant, and sentences on what there is not.
 
     `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
-    agents do the same share that film. An agent that is not there and an environment that cannot be
-    drawn are said; an agent that is not the one of its `run.json` is an error.
+    agents do the same share that film. Runs may name code from outside this package if their
+    configuration is among the reader's `own`. An agent that is not there and an environment that
+    cannot be drawn are said; an agent that is not the one of its `run.json` is an error.
     """
     missing = []
     without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]
@@ -45,20 +50,23 @@ def animations(
     shown = {}
     for environment, of_variants in folders.items():
         try:
-            shown[environment] = _of_one(of_variants, labels)
+            shown[environment] = _of_one(of_variants, labels, own)
         except RenderError as error:
             missing.append(f"{error}.")
     return shown, missing
 
 
-def _of_one(folders: Mapping[str, Path], labels: Mapping[str, str]) -> list[Animation]:
+def _of_one(
+    folders: Mapping[str, Path], labels: Mapping[str, str], own: Collection[object]
+) -> list[Animation]:
     """Of one environment: untrained agents first, then the trained ones."""
     untrained: dict[bytes, tuple[Film, list[str]]] = {}
     trained = []
     for variant, folder in folders.items():
-        before = film(folder, untrained=True, width=WIDTH, seconds=SECONDS)
+        trust = read_record(folder / files.RECORD)["config"] in own
+        before = film(folder, untrained=True, trust=trust, width=WIDTH, seconds=SECONDS)
         untrained.setdefault(gif(before), (before, []))[1].append(variant)
-        after = film(folder, width=WIDTH, seconds=SECONDS)
+        after = film(folder, trust=trust, width=WIDTH, seconds=SECONDS)
         trained.append(_animation(labels[variant], after, gif(after), [variant], True))
     first = []
     for data, (shown, variants) in untrained.items():

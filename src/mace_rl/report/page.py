@@ -21,7 +21,7 @@ from mace_rl.report.animations import Animation
 from mace_rl.report.panels import PAGE_COLOURS, panels, svg
 from mace_rl.results import pages, tables
 from mace_rl.results.claims import FEWEST_SEEDS, POWER
-from mace_rl.results.figures import Look, quantity
+from mace_rl.results.figures import Look, quantity, style
 from mace_rl.results.metrics import all_metrics
 from mace_rl.results.pages import Data, Ledger
 from mace_rl.results.pictures import PICTURES
@@ -76,7 +76,7 @@ def page(
         window=settings.moving_average,
         environments=list(metrics["env"].unique()),
         labels=look.labels,
-        colours={variant: to_hex(colour) for variant, colour in look.colours.items()},
+        colours={variant: style()(to_hex)(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
         figures={figure: _panels(data, figure, settings, look) for figure in FIGURES},
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},

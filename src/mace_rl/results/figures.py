@@ -6,8 +6,8 @@ alone, and the same data gives the same file, byte for byte.
 
 import io
 import math
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # imported where they are used: planning the workflow does wi
 MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
+LETTERS = 140  # about as many as stand side by side in a legend
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
 HIDDEN = 0.01  # of what all means span: lines so near to each other are one to the eye
@@ -206,7 +207,7 @@ def legend(figure: "Figure", explained: str) -> None:
         list(entries.values()),
         list(entries),
         loc="outside lower center",
-        ncols=min(max(len(entries), 1), 4),
+        ncols=max(1, min(len(entries), 4, LETTERS // max(map(len, entries), default=1))),
         title=explained,
     )
     for line in below.get_lines():
@@ -237,21 +238,26 @@ def figure_as_svg(figure: "Figure") -> str:
     return file.getvalue()
 
 
-def style() -> AbstractContextManager[None]:
-    """The settings to draw and to save with: text is laid out on saving."""
+@contextmanager
+def style() -> Iterator[None]:
+    """The settings to draw and to save with, none of them the user's: saving lays text out."""
     import matplotlib
     import seaborn
 
     fonts = {"font.family": "DejaVu Sans", "pdf.fonttype": 42}  # this font comes with matplotlib
     fonts |= {"svg.fonttype": "none", "svg.hashsalt": "mace_rl"}  # text as text; ids that stay
-    return matplotlib.rc_context(
-        seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
-        | seaborn.plotting_context("paper", font_scale=0.9)
-        | {"legend.frameon": False, "legend.title_fontsize": "small", "axes.linewidth": 0.8}
-        | {"axes.titlesize": "small", "figure.labelsize": "medium"}
-        | {f"{axis}tick.major.{part}": size for axis in "xy" for part, size in _TICKS.items()}
-        | fonts
-    )
+    fonts |= {"text.parse_math": False}  # a label may have a $
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(
+            seaborn.axes_style("ticks", {"axes.spines.right": False, "axes.spines.top": False})
+            | seaborn.plotting_context("paper", font_scale=0.9)
+            | {"legend.frameon": False, "legend.title_fontsize": "small", "axes.linewidth": 0.8}
+            | {"axes.titlesize": "small", "figure.labelsize": "medium"}
+            | {f"{axis}tick.major.{part}": size for axis in "xy" for part, size in _TICKS.items()}
+            | fonts
+        )
+        yield
 
 
 def _is_early(curves: "pd.DataFrame", share: float) -> bool:

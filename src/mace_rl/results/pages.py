@@ -18,6 +18,7 @@ from mace_rl.results.records import read_table
 from mace_rl.results.renderings import markdown
 from mace_rl.results.summary import from_to
 
+TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
 RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
@@ -28,7 +29,10 @@ def read_data(
     found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
 ) -> tuple[dict[str, pd.DataFrame], Ledger]:
     """The data of these runs, and the ledger, empty without one, from files by their names."""
-    data = {name: pd.read_csv(path) for name, path in found.items() if str(path).endswith(".csv")}
+    # Names are as they were given, NA and 0.1 too; an empty cell is NaN.
+    how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
+    files = {name: path for name, path in found.items() if str(path).endswith(".csv")}
+    data = {name: pd.read_csv(path, **how) for name, path in files.items()}
     data["metrics"] = read_metrics(found["metrics"], runs, settings)
     if "betas" in found:
         data["betas"] = read_table(found["betas"], BETAS)

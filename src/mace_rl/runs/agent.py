@@ -6,6 +6,7 @@ action = policy(observation).sample()
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,45 +17,47 @@ from mace_rl import files
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import PPO
 from mace_rl.agent.torch_policy import TorchPolicy
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check
+from mace_rl.config.plugins import config_of_run
 from mace_rl.environments.environment import Environment
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError, unarchive
+from mace_rl.runs.observations import encoded
 from mace_rl.runs.provenance import file_digest, read_record
 from mace_rl.trainer import Trainer
 
 
 class PolicyModule(TorchPolicy):
-    """π(·|s) for observations as the environment gives them (Discrete ones: one-hot)."""
+    """π(·|s) for observations as the environment gives them: `mace_rl.runs.observations`."""
 
     mean: Tensor
     std: Tensor
     clip: Tensor
 
-    def __init__(self, ppo: PPO) -> None:
-        super().__init__(ppo.policy)
+    def __init__(self, trainer: Trainer) -> None:
+        super().__init__(trainer.ppo.policy)
+        ppo, self.space = trainer.ppo, trainer.environment.given_space
         mean, std, clip = ppo.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
         self.register_buffer("clip", torch.tensor(clip, dtype=torch.float64))
 
-    def forward(self, observations: Tensor) -> Distribution:
-        """The distribution over actions in each state; observations: [..., observation].
+    def forward(self, observations: Any) -> Distribution:
+        """The distribution over actions in each state; observations: one, or a batch of them.
 
-        Discrete actions count from 0; the others are not clipped to their bounds.
+        Discrete actions count from 0; the others are not clipped to their bounds. Raises
+        `ObservationError` for what is no observation.
         """
-        observations = torch.as_tensor(observations)
-        seen = ((observations - self.mean) / self.std).clip(-self.clip, self.clip).float()
+        rows = encoded(observations, self.space, len(self.mean)).to(self.mean.device)
+        seen = ((rows - self.mean) / self.std).clip(-self.clip, self.clip).float()
         return super().forward(seen)
 
 
 class Agent(torch.nn.Module):
     """The policy and the critics, whose inputs are observations normalised as the policy's."""
 
-    def __init__(self, ppo: PPO) -> None:
+    def __init__(self, trainer: Trainer) -> None:
         super().__init__()
-        self.policy = PolicyModule(ppo)
+        self.policy, ppo = PolicyModule(trainer), trainer.ppo
         self.critics = torch.nn.ModuleDict(
             {kind: critic.module() for kind, critic in ppo.critics.items()}
         )
@@ -71,31 +74,28 @@ class MostProbable(NetworkActing):
         return action, self.policy.log_probs(outputs, np.array([action]))[0]
 
 
-def load_agent(directory: str | Path) -> Agent:
-    """The agent of the finished run in `directory`. Raises what `read_agent` raises."""
-    config, state = read_agent(Path(directory))
-    agent = Agent(Trainer(config).ppo)
-    agent.load_state_dict(state)
-    return agent
+def load_agent(directory: str | Path, trust: bool = False) -> Agent:
+    """The agent of the finished run in `directory`. Raises what `restored` raises."""
+    return restored(Path(directory), trust)[1]
 
 
-def load_acting(directory: Path, deterministic: bool = False) -> tuple[Environment, ActingPolicy]:
+def load_acting(
+    directory: Path, deterministic: bool = False, trust: bool = False
+) -> tuple[Environment, ActingPolicy]:
     """The environment of the finished run in `directory`, and its policy for rollouts.
 
     That samples its actions, or if `deterministic` takes the most probable ones. Raises what
-    `read_agent` raises.
+    `restored` raises.
     """
-    config, state = read_agent(directory)
-    trainer = Trainer(config)
-    policy, prefix = trainer.ppo.policy, "policy.network."
-    policy.network.load_module_state(
-        {n.removeprefix(prefix): tensor for n, tensor in state.items() if n.startswith(prefix)}
-    )
+    trainer, agent = restored(directory, trust)
+    policy, loaded = trainer.ppo.policy, agent.policy
+    policy.network.load_module_state(loaded.network.state_dict())
     if not policy.discrete:
-        policy.log_std[:] = state["policy.log_std"].numpy()
-    mean, std = state["policy.mean"].numpy(), state["policy.std"].numpy()
-    normalisation = Normalisation.of(mean, std, float(state["policy.clip"]))
-    return trainer.environment, acting(trainer.ppo, normalisation, deterministic)
+        policy.log_std[:] = loaded.log_std.detach().numpy()
+    mean, std, clip = loaded.mean.numpy(), loaded.std.numpy(), float(loaded.clip)
+    return trainer.environment, acting(
+        trainer.ppo, Normalisation.of(mean, std, clip), deterministic
+    )
 
 
 def acting(ppo: PPO, normalisation: Normalisation, deterministic: bool) -> ActingPolicy:
@@ -105,15 +105,36 @@ def acting(ppo: PPO, normalisation: Normalisation, deterministic: bool) -> Actin
     return ppo.learner.acting(normalisation)
 
 
-def read_agent(directory: Path) -> tuple[RunConfig, dict[str, Tensor]]:
-    """The configuration and the `Agent.state_dict` of the finished run in `directory`.
+def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:
+    """The trainer of the finished run in `directory` as it began, and the agent that came of it.
 
-    Nothing in the file is executed. Raises `CheckpointError` if `agent.pt` is not the file that
-    `run.json` describes, `ProvenanceError` if that is damaged.
+    Nothing in the files is executed, and of the code that they name only this package's unless
+    `trust`: `ConfigError`. Raises `CheckpointError` if `agent.pt` is not the file that `run.json`
+    describes, or has something else than weights of such an agent, and `ProvenanceError` if
+    `run.json` is damaged.
     """
     record = read_record(directory / files.RECORD)
+    config = config_of_run(record["config"], str(directory / files.RECORD), trust)
     path = directory / files.AGENT
     if not path.exists() or file_digest(path) != record["outputs"][files.AGENT]:
         raise CheckpointError(f"{path}: missing, cut off or altered (SHA-256 not as in run.json)")
-    config = check(RunConfig, record["config"], str(directory / files.RECORD))
-    return config, unarchive(path.read_bytes(), path)
+    state = unarchive(path.read_bytes(), path)
+    trainer = Trainer(config)
+    agent = Agent(trainer)
+    wanted = agent.state_dict()
+    for name in [*wanted, *state]:
+        found, right = _kind(state.get(name)), _kind(wanted.get(name))
+        if found != right:
+            raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
+        bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
+        if bad.any():
+            raise CheckpointError(f"{path}: {name} has NaN or Inf in it")
+    agent.load_state_dict(state)
+    return trainer, agent
+
+
+def _kind(entry: Any) -> str:
+    """What an entry of a state is, without its values."""
+    if isinstance(entry, Tensor):
+        return f"{entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
+    return "missing" if entry is None else f"a {type(entry).__name__}"

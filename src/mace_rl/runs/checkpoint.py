@@ -6,6 +6,7 @@ it belongs to (configuration, code, versions); one of another identity is never 
 
 import hashlib
 import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,15 @@ def archive(content: dict[str, Any]) -> bytes:
 
 
 def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
-    """Read back what `archive` wrote; nothing but plain data is accepted (`weights_only`)."""
+    """Read back what `archive` wrote; nothing but plain data is accepted (`weights_only`).
+
+    It is not larger in memory than on disk: torch does not compress.
+    """
     try:
-        return torch.load(io.BytesIO(data), weights_only=True)
+        with zipfile.ZipFile(io.BytesIO(data)) as members:
+            if sum(member.file_size for member in members.infolist()) > len(data):
+                raise ValueError("it is compressed")
+        return dict(torch.load(io.BytesIO(data), weights_only=True))
     except Exception as error:  # torch reports damage by many types
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error

@@ -9,13 +9,15 @@ from mace_rl.numerics.arrays import total
 from mace_rl.runs.agent import load_acting
 
 
-def evaluate(directory: Path, episodes: int, seed: int, deterministic: bool = False) -> np.ndarray:
+def evaluate(
+    directory: Path, episodes: int, seed: int, deterministic: bool = False, trust: bool = False
+) -> np.ndarray:
     """Undiscounted extrinsic returns, [episodes], of the agent in `directory`.
 
     It acts as it did in training, by sampling, or if `deterministic` by its most probable actions.
     Environment and actions draw from `seed`: the environment the same either way.
     """
-    environment, policy = load_acting(directory, deterministic)
+    environment, policy = load_acting(directory, deterministic, trust)
     rollout = rollout_for(environment, policy)
     generator = np.random.default_rng(seed)
     environment.env.reset(seed=seed)

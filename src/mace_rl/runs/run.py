@@ -264,7 +264,7 @@ def write_results(
     """Write the records, the agent and, when those are safe, where they come from."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
-    agent = checkpoint.archive(Agent(trainer.ppo).state_dict())
+    agent = checkpoint.archive(Agent(trainer).state_dict())
     write_atomically(directory / files.AGENT, agent)
     origin = identity | {
         "code": provenance.git_state(),

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mace_rl import files
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check
+from mace_rl.config.plugins import config_of_run
 from mace_rl.refusal import Refusal
 from mace_rl.results.records import RecordError, read_episodes
 from mace_rl.runs.checkpoint import difference
@@ -31,7 +30,7 @@ def reference_runs(folder: Path) -> list[Path]:
     return runs
 
 
-def repeat(run_folder: Path) -> tuple[bool, str]:
+def repeat(run_folder: Path, trust: bool = False) -> tuple[bool, str]:
     """Train as the `run.json` in `run_folder` says; whether records and agent are equal, in words.
 
     Raises `RecordError` if the files there are not those that `run.json` describes.
@@ -39,7 +38,7 @@ def repeat(run_folder: Path) -> tuple[bool, str]:
     from mace_rl.runs.run import run  # PyTorch takes seconds to import
 
     then = read_record(run_folder / files.RECORD)
-    config = check(RunConfig, then["config"], str(run_folder / files.RECORD))
+    config = config_of_run(then["config"], str(run_folder / files.RECORD), trust)
     records = run_folder / files.EPISODES
     before = read_episodes(records, config.episodes, then["outputs"][files.EPISODES])
     with tempfile.TemporaryDirectory() as temporary:
@@ -64,7 +63,7 @@ def repeat(run_folder: Path) -> tuple[bool, str]:
     )
 
 
-def verify(folder: Path, sample: int | None) -> Iterator[str]:
+def verify(folder: Path, sample: int | None, trust: bool = False) -> Iterator[str]:
     """Repeat `sample` runs of `folder` (None: all), at random but always the same; yields lines.
 
     Raises `RecordError` for damaged files and `NotReproducedError` if a run is not reproduced.
@@ -75,7 +74,7 @@ def verify(folder: Path, sample: int | None) -> Iterator[str]:
         runs = [runs[i] for i in sorted(chosen)]
     reproduced = 0
     for run_folder in runs:
-        equal, line = repeat(run_folder)
+        equal, line = repeat(run_folder, trust)
         reproduced += equal
         yield line
     line = f"{reproduced} of {len(runs)} runs equal to the bit"

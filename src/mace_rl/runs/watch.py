@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl import files
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check
+from mace_rl.config.plugins import config_of_run
+from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
 from mace_rl.environments.rollout import draw_noise, roll_out
 from mace_rl.numerics.normaliser import Normalisation
@@ -103,22 +103,23 @@ def film(
     *,
     deterministic: bool = False,
     untrained: bool = False,
+    trust: bool = False,
     width: int = 300,
     seconds: float = 10.0,
 ) -> Film:
     """The first `episodes` that `evaluate` plays with the agent in `directory`, or `untrained`.
 
     The untrained agent is the same one before training: its initial weights, by the run's seed.
-    Raises what `read_agent` raises, and `RenderError` if the environment cannot be drawn.
+    Raises what `restored` raises, and `RenderError` if the environment cannot be drawn.
     """
     record = directory / files.RECORD
-    config = check(RunConfig, read_record(record)["config"], str(record))
+    config = config_of_run(read_record(record)["config"], str(record), trust)
     if untrained:
         trainer = Trainer(config)
         environment, ppo = trainer.environment, trainer.ppo
         policy = acting(ppo, Normalisation.of(*ppo.normalisation()), deterministic)
     else:
-        environment, policy = load_acting(directory, deterministic)
+        environment, policy = load_acting(directory, deterministic, trust)
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):

@@ -1,0 +1,127 @@
+"""What a run's files may not do to whoever reads them: run code, or crash; docs/reliability.md."""
+
+import io
+import json
+import re
+import shutil
+import sys
+import zipfile
+
+import pytest
+import torch
+from shared import LAYER_NORM, call
+
+from mace_rl import files
+from mace_rl.beta.controller import BetaController
+from mace_rl.config.plugins import code_outside, make
+from mace_rl.config.section import ConfigError
+from mace_rl.runs.agent import load_agent
+from mace_rl.runs.checkpoint import CheckpointError, archive
+from mace_rl.runs.provenance import file_digest
+
+PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
+OWN = {"kind": "custom", "estimator": "evil:Own"}
+HOSTILE = {  # by the key that is named
+    "beta.rule": {"beta": PAGER},
+    "bonus.estimator": {"bonus": OWN},
+    "novelty.estimator": {"novelty": OWN},
+    "ppo.network.module": {"ppo": {"network": {"kind": "torch", "module": "evil:Own"}}},
+    "environment": {"environment": "evil:CartPole-v1"},
+    "environment_arguments.a.b": {"environment_arguments": {"a": [1, {"b": ["evil:Own"]}]}},
+    "environment_arguments.c": {"environment_arguments": {"c": {"evil:Own": 1}}},
+}
+
+
+@pytest.fixture
+def kept(trained, tmp_path, monkeypatch):
+    """`kept(change)`: a run with other settings, in a folder with a module of the sender's."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil.py").write_text("open('ran', 'w')")
+    run = tmp_path / "runs/CartPole-v1/mace_fixed/seed0"
+    shutil.copytree(trained("CartPole-v1", "mace_fixed", episodes=2), run)
+
+    def change(**changes):
+        record = json.loads((run / files.RECORD).read_text())
+        for key, value in changes.items():
+            old = record["config"][key] if key in ("novelty", "ppo") else {}
+            record["config"][key] = old | value if old else value
+        record["outputs"][files.AGENT] = file_digest(run / files.AGENT)
+        (run / files.RECORD).write_text(json.dumps(record))
+        return run
+
+    return change
+
+
+@pytest.mark.parametrize("key", HOSTILE)
+def test_a_run_runs_only_this_package_s_code(kept, monkeypatch, tmp_path, key):
+    run = kept(**HOSTILE[key])
+    for words in (f"evaluate {run}", f"watch {run}", f"watch {run} --untrained", "verify ."):
+        code, said = call(monkeypatch, *words.split())
+        assert code == 1 and re.search(rf"run\.json: {key} has .*--trust", said), said
+    with pytest.raises(ConfigError, match="trust=True"):
+        load_agent(run)
+    for words in (["export", ".", "--out", "a.csv"], ["tensorboard", "."]):
+        assert call(monkeypatch, *words) == (0, "")
+    assert not (tmp_path / "ran").exists() and "evil" not in sys.modules
+
+
+def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkeypatch, tmp_path):
+    run = kept(beta=PAGER)
+    for words in (["evaluate", str(run)], ["watch", str(run)], ["verify", "."]):
+        code, said = call(monkeypatch, *words, "--trust")
+        assert code == 1 and "beta.rule has 'pydoc:pipepager', but it should name" in said
+    assert not (tmp_path / "ran").exists()
+    folder = str(trained("CartPole-v1", "ppo", episodes=2, ppo={"network": LAYER_NORM}))
+    for words in (["evaluate", folder], ["watch", folder, "--out", "a.gif"]):
+        assert call(monkeypatch, *words, "--trust") == (0, "")
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        *("pydoc:pipepager", "subprocess:call", "os:system", "collections:OrderedDict"),
+        *("mace_rl.runs.provenance:subprocess", "mace_rl.files:write_atomically", "numpy:array"),
+    ],
+)
+@pytest.mark.parametrize(("kind", "functions"), [(BetaController, False), (torch.nn.Module, True)])
+def test_what_is_of_another_kind_is_not_called(reference, kind, functions):
+    with pytest.raises(ConfigError, match=f"key has '{reference}', but it should name a subclass"):
+        make(reference, "key", kind, functions, "touch ran")
+
+
+def test_names_of_this_package_and_other_texts_are_no_code_from_outside():
+    assert not code_outside({"a": ["mace_rl.x:Y", "mace_rl:Z", "CartPole-v1", 1, None, {2: "b"}]})
+    assert [*code_outside({"a": "mace_rl_x:Y", "b": [" os:X"], "c": ":"})] == ["c", "b", "a"]
+
+
+def compressed():
+    """A zip file that unpacks to more than it is."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("archive/data/0", bytes(10**6))
+    return data.getvalue()
+
+
+BIAS = "policy.network.2.bias"
+DAMAGE = {
+    f"{BIAS} is .*shape .3,.*should be .*shape .64,": lambda s: archive(s | {BIAS: torch.ones(3)}),
+    f"{BIAS} has NaN or Inf": lambda s: archive(s | {BIAS: s[BIAS] * torch.nan}),
+    f"{BIAS} is .*float64": lambda s: archive(s | {BIAS: s[BIAS].double()}),
+    f"{BIAS} is a str": lambda s: archive(s | {BIAS: "x"}),
+    f"{BIAS} is missing": lambda s: archive({k: v for k, v in s.items() if k != BIAS}),
+    "other is .* should be missing": lambda s: archive(s | {"other": torch.ones(1)}),
+    "not a readable archive: it is compressed": lambda _: compressed(),
+    "not a readable archive": lambda _: archive(torch.ones(3)),
+    "not a readable archive: File": lambda _: b"no archive",
+}
+
+
+@pytest.mark.parametrize("message", DAMAGE)
+def test_an_agent_that_does_not_fit_is_refused_by_the_entry(kept, message):
+    run = kept()
+    state = torch.load(run / files.AGENT, weights_only=True)
+    (run / files.AGENT).write_bytes(DAMAGE[message](state))
+    kept()  # with its digest
+    with pytest.raises(CheckpointError, match=rf"agent\.pt: {message}") as caught:
+        load_agent(run)
+    assert "\n" not in str(caught.value)
