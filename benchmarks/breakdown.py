@@ -21,14 +21,13 @@ from mace_rl.results.paper import CARTPOLE, HOPPER
 # bookkeeping.
 SECTIONS = {
     "environment": "environment.env.reset environment.env.step",
-    "acting": "",  # see `instrument`
+    "acting": "",  # see `instrument` and `FUNCTIONS`, as for the updates
     "bookkeeping": "",
     "critics' values, advantages": "ppo.advantages_and_returns",
-    "update: actor": "ppo.improve_policy",
-    "update: critics": "ppo.critics.extrinsic.learn",
+    "update: actor": "",
+    "update: critics": "",
 }
 BONUS = {
-    "update: critics": "ppo.critics.intrinsic.learn",
     "novelty: k-NN": "curiosity.novelty.knn_novelty curiosity.novelty._replace_redundant",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.refresh",
     "memory": "curiosity.memory.recall curiosity.memory.write",
@@ -38,7 +37,9 @@ ALL_SECTIONS = list(SECTIONS | BONUS)
 # Functions of modules: section, module, name.
 FUNCTIONS = (
     ("acting", "mace_rl.trainer", "draw_noise"),
-    ("acting", "mace_rl.agent.kernels", "act_box"),
+    ("acting", "mace_rl.agent.policy", "act_box"),
+    ("update: actor", "mace_rl.agent.compiled_learner", "improve_policy"),
+    ("update: critics", "mace_rl.agent.compiled_learner", "improve_values"),
     ("memory", "mace_rl.bonus.curiosity", "relevance"),
 )
 

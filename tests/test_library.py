@@ -89,12 +89,12 @@ MISTAKES = {
     "episodes is 0, but should be greater than 0": {"episodes": 0},
     "variant has 'mace_ful'": {"variant": "mace_ful"},
     "seed is 1.5": {"seed": 1.5},
-    "environment_arguments.d is datetime.date(2024, 1, 1), but should be a number": given(
+    "environment_arguments.d is datetime.date(2024, 1, 1), but it should be made of": given(
         datetime.date(2024, 1, 1)
     ),
-    "environment_arguments.d.list.0 is {1}": given([{1}]),
-    "environment_arguments.d.dict.1.[key] is 1": given({1: 2}),
-    "environment_arguments.d.float is nan, but should be a finite": given(math.nan),
+    "environment_arguments.d is [{1}], but": given([{1}]),
+    "environment_arguments.d is {1: 2}, but": given({1: 2}),
+    "environment_arguments.d is nan, but it should be made of finite": given(math.nan),
     "environment_arguments.d is array(": given(np.zeros(2)),
     "environment_arguments.d is <built-in function len>": given(len),
     "environment_arguments.d is b'x'": given(b"x"),

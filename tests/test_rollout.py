@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
-from shared import ENGINES, Bonanza, environment_of
+from shared import ENGINES, Bonanza, acting, environment_of
 
-from mace_rl.agent.network import mlp
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import classic_control
@@ -20,6 +19,7 @@ from mace_rl.environments.rollout import (
     roll_out_compiled,
     rollout_for,
 )
+from mace_rl.numerics.network import mlp
 
 CLASSIC = ["CartPole-v1", "Acrobot-v1"]
 
@@ -31,17 +31,15 @@ def bits(episode: Episode) -> list[tuple]:
 
 def new_policy(environment: Environment, hidden, rng, log_std=0.0, engine="compiled") -> Policy:
     """A policy as training starts with it."""
-    space = environment.action_space
-    outputs = int(space.n) if isinstance(space, Discrete) else space.shape[0]
-    module = mlp([environment.observation_size, *hidden, outputs], 0.01, rng)
-    return Policy(ENGINES[engine](module), space, log_std)
+    module = mlp([environment.observation_size, *hidden, environment.action_size], 0.01, rng)
+    return Policy(ENGINES[engine](module), environment.action_space, log_std)
 
 
 def uniform_policy(environment: Environment, **settings) -> ActingPolicy:
     """Nearly the same distribution in every state."""
     size = environment.observation_size
     policy = new_policy(environment, [4], np.random.default_rng(0), **settings)
-    return policy.for_acting(np.zeros(size), np.ones(size), np.inf)
+    return acting(policy, np.zeros(size), np.ones(size), np.inf)
 
 
 def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
@@ -50,7 +48,7 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
     policy = new_policy(environment, [4] if kind == "skilled" else [64, 64], rng)
     if kind == "erratic":  # and normalised, as in training with normalise_observations
         policy.parameters[:] = 2 * rng.standard_normal(len(policy.parameters))
-        return policy.for_acting(rng.standard_normal(size), np.exp(rng.standard_normal(size)), 1.5)
+        return acting(policy, rng.standard_normal(size), np.exp(rng.standard_normal(size)), 1.5)
     # Balances CartPole to the time limit; swings Acrobot up.
     policy.parameters[:] = 0
     (weights, _), (readout, _) = policy.network.layers(policy.network.parameters)
@@ -60,7 +58,7 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
         weights[4, 0] = -0.5
     sharpness = rng.uniform(20, 60)
     readout[0, [0, -1]] = [-sharpness, sharpness]
-    return policy.for_acting(np.zeros(size), np.ones(size), np.inf)
+    return acting(policy, np.zeros(size), np.ones(size), np.inf)
 
 
 def play(environment: Environment) -> Episode:

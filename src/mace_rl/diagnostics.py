@@ -5,11 +5,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mace_rl.agent.advantages import mean, variance
-from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.agent.ppo import Update
-from mace_rl.agent.products import dot
+from mace_rl.agent.learner import Update
 from mace_rl.experience import Experience
+from mace_rl.numerics.arrays import mean, variance
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.products import dot
 from mace_rl.results.records import UpdateRecord
 
 

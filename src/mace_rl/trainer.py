@@ -16,14 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import (
-    mean,
-    normalised,
-    normalised_change,
-    root_mean_square,
-    total,
-)
-from mace_rl.agent.ppo import Batch, Update
+from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.learner import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
@@ -38,7 +32,8 @@ from mace_rl.experience import (
     total_advantages,
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
-from mace_rl.finite import TOO_LARGE, require_finite, require_share
+from mace_rl.numerics.arrays import mean, root_mean_square, total
+from mace_rl.numerics.finite import TOO_LARGE, require_finite, require_within
 from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
@@ -125,11 +120,11 @@ class Trainer:
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta = self.controller.beta
-            require_share("β", beta)
+            require_within("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
             largest = min(self.curiosity.largest, TOO_LARGE)
-            require_share("the curiosity bonus", reward, 1e-6, largest)
+            require_within("the curiosity bonus", reward, 1e-6, largest)
             reward = np.maximum(reward, 0.0)
             intrinsic_advantages, intrinsic_returns = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
@@ -177,10 +172,10 @@ class Trainer:
             extrinsic -= mean(extrinsic)
         total = total_advantages(rollout)
         changes = [normalised_change(total, part, centred) for part in intrinsic_parts(rollout)]
-        gradient, *changes = self.ppo.policy_gradients(*steps(rollout), [extrinsic, *changes])
-        adam = self.ppo.optimisers["actor"]
+        learner = self.ppo.learner
+        gradient, *changes = learner.policy_gradients(*steps(rollout), [extrinsic, *changes])
         effects = [
-            Effect(adam.preconditioned(change), root_mean_square(item.intrinsic_part))
+            Effect(learner.preconditioned(change), root_mean_square(item.intrinsic_part))
             for change, item in zip(changes, rollout, strict=True)
         ]
         return self.controller.learn(gradient, root_mean_square(extrinsic), effects)
@@ -196,14 +191,14 @@ class Trainer:
                 *steps(rollout),
                 log_probs=joined([item.episode.log_probs for item in rollout]),
                 advantages=advantages.astype(np.float32),
-                returns=returns,
-            )
+            ),
+            returns,
         )
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
-        for name, adam in self.ppo.optimisers.items():
-            require_finite(f"a weight of the {name}", adam.parameters)
+        for name, parameters in self.ppo.learner.parameters.items():
+            require_finite(f"a weight of the {name}", parameters)
         for item in rollout:
             self.ppo.normaliser.update(item.episode.observations[:-1])
         if not self.diagnostics and (dimensions := unseen(self.ppo.normaliser)):

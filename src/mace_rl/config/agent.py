@@ -1,6 +1,6 @@
 """Settings of `mace_rl.agent`: networks, critics and PPO."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
@@ -24,39 +24,6 @@ class TorchModule(Section):
 NetworkConfig = CompiledNetwork | TorchModule
 
 
-class NetworkValue(Section):
-    """A critic that is a network, as the policy is."""
-
-    kind: Literal["network"]
-
-    def __str__(self) -> str:
-        return "network"
-
-
-class DictionaryValue(Section):
-    """A critic that is a dictionary of states and returns (Pritzel et al. 2017)."""
-
-    kind: Literal["dictionary"]
-    capacity: Count  # states
-    neighbours: Count  # k, whose returns make a value
-    kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
-    learning_rate: PositiveFloat = Field(le=1)  # α, at which a remembered state's return moves
-
-    def __str__(self) -> str:
-        return f"dictionary of {self.capacity} states"
-
-    @model_validator(mode="after")
-    def _neighbours_fit(self) -> "DictionaryValue":
-        if self.neighbours > self.capacity:
-            raise ValueError(
-                f"neighbours is {self.neighbours}, which must not exceed capacity, {self.capacity}"
-            )
-        return self
-
-
-CriticConfig = NetworkValue | DictionaryValue
-
-
 class PPOConfig(Section):
     """Proximal Policy Optimization (paper, Table 2; Schulman et al. 2017)."""
 
@@ -73,7 +40,6 @@ class PPOConfig(Section):
     minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
     hidden_units: list[Units] = Field(min_length=1)
-    critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat
     normalise_observations: bool
@@ -85,3 +51,11 @@ class PPOConfig(Section):
     scale_advantages: bool
     smallest_advantage: PositiveFloat
     centre_advantages: bool  # subtract the rollout's mean from total advantages
+
+    @model_validator(mode="before")
+    @classmethod
+    def _critics_are_networks(cls, values: Any) -> Any:
+        # Records of earlier runs say so; there is nothing else to say any more.
+        if isinstance(values, dict) and values.get("critic") == {"kind": "network"}:
+            return {key: value for key, value in values.items() if key != "critic"}
+        return values

@@ -8,7 +8,7 @@ from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class MemoryConfig(Section):
-    """Episodic memory: a differentiable neural dictionary (paper, supplement)."""
+    """Episodic memory: a neural dictionary (paper, supplement)."""
 
     capacity: Count  # entries
     neighbours: Count  # k of the top-k lookup

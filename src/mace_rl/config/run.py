@@ -34,7 +34,7 @@ class RunConfig(Section):
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
     environment_arguments: Arguments = Field(default={})  # for the environment's constructor
-    engine: Literal["compiled", "torch"] = "compiled"  # of every network
+    engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
     memory: MemoryConfig | None = None

@@ -2,12 +2,12 @@
 
 import difflib
 import json
+import math
 import re
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic.types import JsonValue
 from pydantic_core import ErrorDetails
 
 from mace_rl.refusal import Refusal
@@ -44,13 +44,18 @@ Reference = Annotated[str, AfterValidator(_reference)]
 
 def _plain(value: Any, depth: int = 0) -> Any:
     """With lists for tuples and Python's numbers for NumPy's, as JSON would give it back."""
-    if depth > 100:
-        raise ValueError("it should have at most 100 levels")
-    if isinstance(value, dict):
+    value = value.item() if getattr(value, "shape", None) == () else value
+    if depth < 100 and isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: _plain(item, depth + 1) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if depth < 100 and isinstance(value, list | tuple):
         return [_plain(item, depth + 1) for item in value]
-    return value.item() if getattr(value, "shape", None) == () else value
+    finite = not isinstance(value, float) or math.isfinite(value)
+    if finite and (value is None or isinstance(value, bool | int | float | str)):
+        return value
+    raise ValueError(
+        "it should be made of finite numbers, texts, true, false, null, lists and mappings from "
+        "texts, as run.json holds them"
+    )
 
 
 def _writable(values: dict[str, Any]) -> dict[str, Any]:
@@ -59,9 +64,7 @@ def _writable(values: dict[str, Any]) -> dict[str, Any]:
 
 
 # Of the user's own code and of environments: what trains is what run.json brings back.
-Arguments = Annotated[
-    dict[str, Annotated[JsonValue, BeforeValidator(_plain)]], AfterValidator(_writable)
-]
+Arguments = Annotated[dict[str, Annotated[Any, BeforeValidator(_plain)]], AfterValidator(_writable)]
 
 
 def check(model: type[Model], values: Any, origin: str) -> Model:
@@ -87,9 +90,6 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
                 f"unknown key {key!r} (value {short(problem['input'])}); "
                 f"the nearest known key is {nearest[0]!r}"
             )
-        case "invalid-json-value":
-            right = "a number, text, true, false, null, a list or a mapping, as run.json holds it"
-            return f"{key} is {short(problem['input'])}, but should be {right}"
         case "missing":
             return f"the key {key!r} is missing"
         case _:

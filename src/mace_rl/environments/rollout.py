@@ -15,7 +15,7 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 from mace_rl.agent.policy import ActingPolicy, CompiledActing
 from mace_rl.environments import classic_control
 from mace_rl.environments.environment import Environment
-from mace_rl.finite import TOO_LARGE, require_finite
+from mace_rl.numerics.finite import TOO_LARGE, require_finite
 
 COMPILED = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}  # what the compiled loop plays
 

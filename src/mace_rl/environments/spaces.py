@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 from mace_rl.config.section import ConfigError, short
-from mace_rl.finite import TOO_LARGE, all_below, require_finite
+from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
 MOST_NUMBERS = 10**6  # in an observation or an action: every network has a row for each
 NUMBERS = "biuf"  # NumPy's kinds of them
@@ -39,6 +39,7 @@ class Spaces:
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
         self.observation_size = int(gymnasium.spaces.flatdim(observations))
+        self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
 
     def encode(self, observation: Any, step: int | None = None) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]; may be the same memory.

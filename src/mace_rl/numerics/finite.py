@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mace_rl.compiling import njit
+from mace_rl.numerics.compiling import njit
 from mace_rl.refusal import Refusal
 
 # Of a reward, or of a number in an observation. Networks learn in float32: its 7 digits lose an
@@ -31,7 +31,7 @@ def require_finite(
         raise NonFiniteError(f"{name} is {bad:.6g}{where}{why if math.isfinite(bad) else ''}")
 
 
-def require_share(
+def require_within(
     name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
 ) -> None:
     """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`].

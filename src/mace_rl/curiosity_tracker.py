@@ -19,7 +19,7 @@ from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
-from mace_rl.finite import require_share
+from mace_rl.numerics.finite import require_within
 from mace_rl.streams import Streams
 
 # What a step's `info` gets, float.
@@ -34,7 +34,7 @@ class Recording:
     """An episode that goes on: what was played, what it was worth, and at which rates."""
 
     beta: float
-    unit: float  # see `Appraisal.unit`
+    unit: float  # see `CuriosityTracker.unit`
     visits: np.ndarray  # to each Discrete state so far, [observation]; of Box ones 0
     observations: list[np.ndarray]  # the first, and what each step led to, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
@@ -59,7 +59,7 @@ class Recording:
         return cls(*numbers, *(list(parts[name]) for name in LISTS))
 
 
-class Appraisal:
+class CuriosityTracker:
     """Appraises episodes of several environments while they go on."""
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
@@ -67,7 +67,7 @@ class Appraisal:
         streams = Streams(config.seed)
         space, size = spaces.observation_space, spaces.observation_size
         memory = config.memory if config.relevance else None
-        self.curiosity = Curiosity(memory, config.novelty, "compiled", space, size, streams)
+        self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
         self.controller = beta_rule(config.beta, config.rollout_steps, streams["beta"])
         if isinstance(config.beta, CustomBeta) and self.controller.learns:
             raise ConfigError(
@@ -92,10 +92,12 @@ class Appraisal:
     def begin(self, environment: int, observation: Any) -> None:
         """An episode begins; what was played of another is forgotten."""
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
-        require_share("β", beta)
+        require_within("β", beta)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
-    def pay(self, environment: int, action: Any, reward: Any, observation: Any) -> dict[str, float]:
+    def reward_parts(
+        self, environment: int, action: Any, reward: Any, observation: Any
+    ) -> dict[str, float]:
         """`PARTS` of the reward for a step; reward: the extrinsic one; then what it led to."""
         recording, space = self.recordings[environment], self.spaces.action_space
         if recording is None:
@@ -106,7 +108,7 @@ class Appraisal:
         found = self.curiosity.appraise(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
-            require_share("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
+            require_within("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
             bonus = max(bonus, 0.0)
         if self.spaces.discrete_observations:
             recording.visits += state
@@ -141,7 +143,7 @@ class Appraisal:
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 2,  # of the state itself
+            "form": 3,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -32,3 +32,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             config.CACHE_DIR = before
 
     return compiled
+
+
+# Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
+kernel = njit(cache=True, error_model="numpy")
