@@ -142,8 +142,8 @@ class Killed(BaseException):
 
 
 def files(directory: Path) -> list[str]:
-    """Those of a run but for its lock, which stays."""
-    return sorted({path.name for path in directory.iterdir()} - {LOCK})
+    """Those of a run but for its lock, which stays, and for what was set aside."""
+    return sorted({path.name for path in directory.iterdir() if path.is_file()} - {LOCK})
 
 
 def provenance_of(directory: Path) -> dict:

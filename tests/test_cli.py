@@ -160,7 +160,7 @@ def test_a_run_by_hand_then_again_then_as_another_then_damaged(monkeypatch, tmp_
     assert files(out) == RESULTS
     whole = {path.name: path.read_bytes() for path in out.iterdir()}
     caplog.clear()
-    named = [str(out), "choose another folder, or remove this one"]
+    named = [str(out), "choose another folder, or set this run aside: --restart"]
     for option, value, difference in (
         ("--seed", "1", "config.seed was 0 and is 1"),
         ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),

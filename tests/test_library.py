@@ -1,6 +1,8 @@
 """The five names of `mace_rl`, in somebody's own program."""
 
+import datetime
 import json
+import math
 import os
 import re
 import subprocess
@@ -73,12 +75,36 @@ def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
 
 
+OWN = {"kind": "custom", "arguments": {"d": {1}}}
+
+
+def given(value: object) -> dict:
+    """An argument of the environment."""
+    return {"environment_arguments": {"d": value}}
+
+
 MISTAKES = {
     "unknown key 'ppo.clpi'": {"ppo": {"clpi": 0.1}},
     "unknown key 'epsiodes' (value 3); the nearest known key is 'episodes'": {"epsiodes": 3},
     "episodes is 0, but should be greater than 0": {"episodes": 0},
     "variant has 'mace_ful'": {"variant": "mace_ful"},
     "seed is 1.5": {"seed": 1.5},
+    "environment_arguments.d is datetime.date(2024, 1, 1), but should be a number": given(
+        datetime.date(2024, 1, 1)
+    ),
+    "environment_arguments.d.list.0 is {1}": given([{1}]),
+    "environment_arguments.d.dict.1.[key] is 1": given({1: 2}),
+    "environment_arguments.d.float is nan, but should be a finite": given(math.nan),
+    "environment_arguments.d is array(": given(np.zeros(2)),
+    "environment_arguments.d is <built-in function len>": given(len),
+    "environment_arguments.d is b'x'": given(b"x"),
+    "surrogates not allowed": given("\ud800"),
+    "beta.arguments.d is {1}": {"beta": OWN | {"rule": "a:B"}},
+    "bonus.arguments.d is {1}": {"bonus": OWN | {"estimator": "a:B"}},
+    "novelty.arguments.d is {1}": {"novelty": OWN | {"estimator": "a:B"}},
+    "ppo.network.arguments.d is {1}": {
+        "ppo": {"network": OWN | {"kind": "torch", "module": "a:B"}}
+    },
     "--max-episode-steps": {"environment": "Blackjack-v1"},
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
 }
@@ -89,6 +115,22 @@ def test_a_mistake_gets_one_line(message):
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
         settings(**{"environment": "CartPole-v1"} | MISTAKES[message])
     assert "\n" not in str(caught.value)
+
+
+def test_arguments_are_what_json_gives_back(monkeypatch, tmp_path):
+    """So that what is played later is what was trained, and the same call finds its run again."""
+    given = {"map_name": None, "desc": (np.str_("SF"), "FG"), "is_slippery": np.bool_(False)}
+    run = settings("FrozenLake-v1", "ppo", episodes=2, environment_arguments=given)
+    plain = {"map_name": None, "desc": ["SF", "FG"], "is_slippery": False}
+    assert run.environment_arguments == plain
+    assert [*map(type, run.environment_arguments.values())] == [type(None), list, bool]
+    for _ in range(2):
+        train(run, folder=tmp_path)
+    found = json.loads((tmp_path / "run.json").read_text())["config"]
+    assert found["environment_arguments"] == plain
+    other = settings("FrozenLake-v1", "ppo", episodes=3, environment_arguments=given)
+    assert len(train(other, folder=tmp_path, restart=True).episodes) == 3
+    assert json.loads((tmp_path / "_aside1" / "run.json").read_text())["config"] == found
 
 
 def test_train_is_the_command_and_calls_back_for_each_episode(monkeypatch, tmp_path):

@@ -16,7 +16,7 @@ NO_PART = (
     *("results", "report", "wrappers.py", "curiosity_tracker.py", "library.py"),
     *("cli.py", "__main__.py"),
     *("config/reading.py", "config/results.py", "config/study.py", "config/wrappers.py"),
-    *("runs/evaluate.py", "runs/events.py", "runs/export.py", "runs/finished.py"),
+    *("runs/evaluate.py", "runs/events.py", "runs/export.py"),
     *("runs/progress.py", "runs/queueing.py", "runs/verify.py", "runs/watch.py"),
 )
 # The form of a run's records, which is the training's as well.

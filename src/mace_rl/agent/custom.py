@@ -1,5 +1,8 @@
 """A network of the user's own."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 
@@ -20,7 +23,7 @@ def custom_module(
     Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
     are not [N, outputs] or not the same twice: such a run would not resume to the bit.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), as_torch_begins():
         torch.manual_seed(int(generator.integers(2**63)))
         module = make(
             settings.module,
@@ -41,3 +44,15 @@ def custom_module(
         if found:
             raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
     return module.float()
+
+
+@contextmanager
+def as_torch_begins() -> Iterator[None]:
+    """New tensors are float32 on the CPU, whatever the program or the user's module has set."""
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)

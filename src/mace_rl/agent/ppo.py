@@ -11,6 +11,7 @@ from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
 from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.arrays import shuffled
+from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation, RunningNormaliser
 from mace_rl.state import Stateful
@@ -88,6 +89,7 @@ class PPO(Stateful):
             rewards, values, self.config.discount, self.config.gae_lambda
         )
         self.advantage_scales[kind].update(advantages)
+        require_finite(f"an advantage or value of the {kind} reward", advantages)
         return advantages, advantages + values[:-1]
 
     def reward_scale(self, kind: str) -> float:
@@ -97,6 +99,10 @@ class PPO(Stateful):
     def advantage_scale(self, kind: str) -> float:
         """What advantages of one kind are divided by before β weighs them."""
         return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
+
+    def unit(self, kind: str) -> float:
+        """What was paid for an advantage of 1 where β weighs it."""
+        return self.reward_scale(kind) * self.advantage_scale(kind)
 
     def update(self, batch: Batch, returns: Mapping[str, np.ndarray]) -> Update:
         """K epochs over `batch`; returns: for each critic the λ-returns of its steps."""

@@ -2,9 +2,9 @@
 
 from typing import Any, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Reference, Section
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class CompiledNetwork(Section):
@@ -18,7 +18,7 @@ class TorchModule(Section):
 
     kind: Literal["torch"]
     module: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 NetworkConfig = CompiledNetwork | TorchModule
@@ -30,16 +30,16 @@ class PPOConfig(Section):
     actor_learning_rate: PositiveFloat = Field(lt=1)
     critic_learning_rate: PositiveFloat = Field(lt=1)
     discount: float = Field(ge=0, le=1)  # γ
-    epochs: PositiveInt  # K, passes over the rollout at each update
+    epochs: Count  # K, passes over the rollout at each update
     clip: PositiveFloat = Field(lt=1)  # ε
     gae_lambda: float = Field(ge=0, le=1)  # λ; 1 is the Monte Carlo return minus the baseline
     entropy_coefficient: NonNegativeFloat
     # An update follows the first episode end at which this many steps have been collected, so 1
     # is one update per episode. Rollouts are whole episodes: β belongs to an episode.
-    rollout_steps: PositiveInt
-    minibatch_size: PositiveInt | None  # None: the whole rollout is one batch
+    rollout_steps: Count
+    minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
-    hidden_units: list[PositiveInt] = Field(min_length=1)
+    hidden_units: list[Units] = Field(min_length=1)
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat
     normalise_observations: bool

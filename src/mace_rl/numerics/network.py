@@ -162,7 +162,7 @@ def mlp(
 def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
     """The layers of `mlp`, with weights that mean nothing."""
     generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-    linear = [torch.nn.Linear(*pair) for pair in pairwise(sizes)]
+    linear = [torch.nn.Linear(*pair, device="cpu", dtype=torch.float32) for pair in pairwise(sizes)]
     torch.set_rng_state(generator)
     layers = [part for one in linear for part in (one, torch.nn.Tanh())]
     return torch.nn.Sequential(*layers[:-1])
