@@ -55,7 +55,7 @@ class TorchLearner(Stateful):
     ) -> Update:
         """See `Learner`. One loss will do: the networks share no weights."""
         for order in minibatches.epochs:
-            told = torch.zeros(3)
+            told = np.zeros(3)
             for chosen in np.split(order, minibatches.ends[:-1]):
                 targets = {kind: values[chosen] for kind, values in returns.items()}
                 loss, means = self.losses(Batch(*(part[chosen] for part in batch)), targets)
@@ -64,7 +64,7 @@ class TorchLearner(Stateful):
                 most = self.config.max_gradient_norm
                 norms = {n: clip_grad_norm_(part, most).item() for n, part in self.weights.items()}
                 self.optimiser.step()
-                told += means * len(chosen) / len(order)
+                told += means.numpy() * len(chosen) / len(order)
         return Update(norms, *told.tolist())
 
     def acting(self, normalisation: Normalisation) -> ActingPolicy:
