@@ -41,7 +41,7 @@ from mace_rl import sources
 from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.environments import hopper
-from mace_rl.files import LOCK
+from mace_rl.files import LOCK, write_atomically
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
 from mace_rl.trainer import Trainer
@@ -294,6 +294,16 @@ def test_killed_while_writing(
     (directory / ".checkpoint.pt.12345.tmp").write_bytes(b"half a check")  # goes
     (interruption,) = completes(config, directory)["interruptions"]
     assert interruption["after_episode"] == after
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*/episodes\.csv'"):
+        write_atomically(tmp_path / "episodes.csv", "")
+    assert not list(tmp_path.iterdir())
 
 
 def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path, monkeypatch):

@@ -4,9 +4,12 @@ import io
 import math
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
+from gymnasium.wrappers import TransformObservation
 from shared import LAYER_NORM, VARIANTS, Bonanza, Twin, finish
 
 from mace_rl.beta.meta import MetaAdaptation
@@ -301,12 +304,20 @@ def test_another_seed_is_another_run(run_config):
     assert states[0] != states[1] and runs[0].records != runs[1].records
 
 
-@pytest.mark.parametrize("settings", ["an episode", "a network of one's own"])
+@pytest.mark.parametrize("settings", ["an episode", "torch", "a network of one's own"])
 def test_global_generators_are_left_alone(run_config, settings):
     """Nothing depends on them, and nothing that uses them is disturbed."""
     changes = {"episodes": 4, "novelty": SOON} | SETTINGS[settings]
     config = run_config("CartPole-v1", "mace_full", 0, **changes)
     expected = finish(config).records
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        assert finish(config).records == expected
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
     np.random.seed(123)  # noqa: NPY002
     torch.manual_seed(123)
     before = np.random.get_state()[1].copy(), torch.get_rng_state()  # noqa: NPY002
@@ -413,20 +424,54 @@ def test_it_learns_what_pays(run_config, register, variant, network):
 
 @pytest.mark.parametrize(
     ("where", "value"),
-    [("reward", np.nan), ("observation", np.inf), ("first observation", -np.inf)],
+    [
+        *(("reward", value) for value in (np.nan, 1e160, -1.7e308)),
+        ("observation", np.inf),
+        ("observation", np.float32(-3e38)),
+        ("first observation", -np.inf),
+    ],
 )
-def test_bad_numbers_stop_the_run_and_say_where(run_config, register, where, value):
+@pytest.mark.parametrize(("variant", "scaled"), [("ppo", True), ("mace_full", False)])
+def test_bad_numbers_stop_the_run_and_say_where(
+    run_config, register, where, value, variant, scaled
+):
     name = register("Bonanza-v0", Bonanza, 5, where=where, value=value)
-    trainer = Trainer(run_config(name, "mace_full", 7, episodes=9))
+    settings = {"scale_rewards": scaled, "scale_advantages": scaled}
+    trainer = Trainer(run_config(name, variant, 7, episodes=9, ppo=settings))
     finished = []
     with pytest.raises(NonFiniteError) as caught:
         for records in trainer.run():
             finished += records
     place = "the reset" if "first" in where else "step 3"
     what = where.removeprefix("first ")
-    message = f"Bonanza-v0 mace_full seed 7, episode 4: the {what} is {value} after {place}"
-    assert str(caught.value) == message
+    message = f"Bonanza-v0 {variant} seed 7, episode 4: the {what} is {value:g} after {place}"
+    assert str(caught.value).partition(", but float32 learns from less than 1e+12")[0] == message
     assert len(finished) == 3
+
+
+def moved(unit: float, offset: float, reward: float = 0.0) -> gymnasium.Env:
+    """Bonanza with another first dimension and a large reward."""
+    space, env = Box(-1e9, 1e9, (2,), np.float64), Bonanza("reward", reward)
+    return TransformObservation(env, lambda x: x * [unit, 1.0] + [offset, 0.0], space)
+
+
+LOST = "differences in observation[0]"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        *(((unit, offset), LOST) for unit, offset in ((1e-9, 0), (1, 1e8), (1, 1e7))),
+        *(((unit, offset), "") for unit, offset in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
+        ((1, 0, 1e11), "the rewards of episode 4"),
+    ],
+)
+def test_what_is_lost_is_named_once(run_config, register, caplog, given, said):
+    names = ("unit", "offset", "reward")
+    name = register("Moved-v0", moved, 50, **dict(zip(names, given, strict=False)))
+    finish(run_config(name, "ppo", 0, episodes=9))
+    found = [record.message.split(" are")[0] for record in caplog.records]
+    assert found == ([f"Moved-v0: {said}"] if said else [])
 
 
 @pytest.mark.parametrize("place", [0, -1])  # around every tanh

@@ -433,18 +433,34 @@ GOOD, THREE = np.zeros(4, np.float32), Discrete(3, start=5)
         (
             observing([GOOD, []]),
             ConfigError,
-            r"gave an observation of shape \(0,\), but its observation_space",
+            r"the observation \[\] of shape \(0,\) after step 1, but its observation_space",
         ),
-        (observing([GOOD, [0]]), ConfigError, r"of shape \(1,\), but"),  # numpy would stretch it
-        (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\), but"),
-        (observing([5, 6, 7, 8], THREE), ConfigError, "number 8, but its observation_space is"),
-        (observing([4], THREE), ConfigError, "number 4, but its observation_space is"),
+        (
+            observing([GOOD, [0]]),
+            ConfigError,
+            r"of shape \(1,\) after step 1, but",
+        ),  # numpy would stretch it
+        (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\) after step 1, but"),
+        (observing([5, 6, 7, 8], THREE), ConfigError, "observation 8 of shape .* after step 3"),
+        (observing([4], THREE), ConfigError, "observation 4 of shape .* after the reset"),
         (paying(np.nan), NonFiniteError, "the reward is nan after step 3"),
         (paying(np.inf), NonFiniteError, "the reward is inf after step 3"),
-        # In the first episode, which is new whatever it is, and when novelty is estimated.
-        (observing([GOOD, *[GOOD + np.inf] * 99]), NonFiniteError, "an observation is inf"),
-        (observing([GOOD] * 80 + [GOOD + np.inf]), NonFiniteError, "curiosity bonus is nan"),
-        (observing([GOOD] * 80 + [GOOD + np.nan]), NonFiniteError, "curiosity bonus is nan"),
+        (
+            paying(-1.7e308),
+            NonFiniteError,
+            r"reward is -1.7e\+308 after step 3, but float32 learns",
+        ),
+        (
+            paying(None),
+            ConfigError,
+            "gave None as reward after step 3, but it should be one number",
+        ),
+        (
+            observing([GOOD, *[GOOD + np.inf] * 99]),
+            NonFiniteError,
+            "observation is inf after step 1",
+        ),
+        (observing([[1e200] * 4]), NonFiniteError, r"observation is 1e\+200 after the reset, but"),
     ],
 )
 def test_what_goes_wrong_stops_it(env, error, message):

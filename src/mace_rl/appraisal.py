@@ -1,7 +1,6 @@
 """Curiosity while an episode is played: what `mace_rl.wrappers` ask of it, step by step."""
 
 import copy
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +19,7 @@ from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
-from mace_rl.finite import require_finite, require_share
+from mace_rl.finite import require_share
 from mace_rl.streams import Streams
 
 # What a step's `info` gets, float.
@@ -50,7 +49,7 @@ class Recording:
 
     def state_dict(self) -> dict[str, Any]:
         """Each part as a tensor."""
-        return {name: torch.tensor(np.array(part)) for name, part in vars(self).items()}
+        return {name: torch.from_numpy(np.array(part)) for name, part in vars(self).items()}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Recording":
@@ -92,20 +91,18 @@ class Appraisal:
 
     def begin(self, environment: int, observation: Any) -> None:
         """An episode begins; what was played of another is forgotten."""
-        first, beta = np.array(self.spaces.encode(observation)), self.controller.beta
+        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
         require_share("β", beta)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
-    def pay(
-        self, environment: int, action: Any, reward: float, observation: Any
-    ) -> dict[str, float]:
+    def pay(self, environment: int, action: Any, reward: Any, observation: Any) -> dict[str, float]:
         """`PARTS` of the reward for a step; reward: the extrinsic one; then what it led to."""
         recording, space = self.recordings[environment], self.spaces.action_space
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        if not math.isfinite(reward):
-            require_finite("the reward", reward, f" after step {len(recording.rewards) + 1}")
-        state = np.array(self.spaces.encode(observation))  # a copy
+        step = len(recording.rewards) + 1
+        reward = self.spaces.paid(reward, step)
+        state = np.array(self.spaces.encode(observation, step))  # a copy
         found = self.curiosity.appraise(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
@@ -130,7 +127,6 @@ class Appraisal:
         assert recording is not None
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
-        require_finite("an observation", episode.observations)
         for scale, rewards in zip(self.scales, (episode.rewards, bonus), strict=True):
             scale.update(rewards)
         values = np.zeros(len(episode) + 1)  # with λ = 1 only rewards are left: no critic

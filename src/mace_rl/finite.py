@@ -7,18 +7,28 @@ import numpy as np
 from mace_rl.compiling import njit
 from mace_rl.refusal import Refusal
 
+# Of a reward, or of a number in an observation. Networks learn in float32: its 7 digits lose an
+# ordinary reward beside a larger one, and sums of larger squares are infinite.
+TOO_LARGE = 1e12
+
 
 class NonFiniteError(Refusal, ArithmeticError):
     """NaN, Inf or a number out of its range; the message says in what, and where in the run."""
 
 
-def require_finite(name: str, values: float | np.ndarray, where: str = "") -> None:
-    """Raise `NonFiniteError` if `values` has a NaN or Inf; `where` ends the message."""
-    good = math.isfinite(values) if isinstance(values, float) else all_finite(values)
+def require_finite(
+    name: str, values: float | np.ndarray, where: str = "", too_large: float = math.inf
+) -> None:
+    """Raise `NonFiniteError` if `values` has a NaN or what is not within ±`too_large`.
+
+    `where` follows the number in the message.
+    """
+    good = abs(values) < too_large if isinstance(values, float) else all_below(values, too_large)
     if not good:
         found = np.asarray(values)
-        bad = found[~np.isfinite(found)].ravel()[0]
-        raise NonFiniteError(f"{name} is {bad}{where}")
+        bad = found[~(abs(found) < too_large)].ravel()[0]
+        why = f", but float32 learns from less than {too_large:g}: use a larger unit"
+        raise NonFiniteError(f"{name} is {bad:.6g}{where}{why if math.isfinite(bad) else ''}")
 
 
 def require_share(
@@ -36,9 +46,9 @@ def require_share(
 
 
 @njit(cache=True)
-def all_finite(values: np.ndarray) -> bool:
-    """Whether an array of any shape has neither NaN nor Inf."""
+def all_below(values: np.ndarray, bound: float) -> bool:
+    """Whether an array of any shape has neither a NaN nor what is not within ±`bound`."""
     good = True
     for value in values.flat:
-        good &= np.isfinite(value)
+        good &= abs(value) < bound
     return good

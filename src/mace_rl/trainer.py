@@ -9,6 +9,7 @@ rooms `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta
 `environments`; `factories` makes it as the settings ask for.
 """
 
+import logging
 from collections.abc import Iterator
 from typing import Any
 
@@ -25,7 +26,7 @@ from mace_rl.agent.advantages import (
 from mace_rl.agent.ppo import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
-from mace_rl.diagnostics import diagnose
+from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
@@ -37,9 +38,12 @@ from mace_rl.experience import (
     total_advantages,
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
-from mace_rl.finite import NonFiniteError, require_finite, require_share
+from mace_rl.finite import TOO_LARGE, require_finite, require_share
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
+
+logger = logging.getLogger(__name__)
 
 
 class Trainer:
@@ -84,8 +88,8 @@ class Trainer:
                 where = (
                     f"the update after episode {played}" if updating else f"episode {played + 1}"
                 )
-                if isinstance(error, NonFiniteError):
-                    raise NonFiniteError(f"{run}, {where}: {error}") from None
+                if isinstance(error, Refusal):
+                    raise type(error)(f"{run}, {where}: {error}") from error.__cause__
                 error.add_note(f"in {run}, {where}")
                 raise
             yield self.records[start:]
@@ -108,9 +112,15 @@ class Trainer:
     def appraise(self, episode: Episode) -> Experience:
         """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
         observations = self.ppo.normalise(episode.observations)
+        unit = self.ppo.unit("extrinsic")
         extrinsic_advantages, extrinsic_returns = self.ppo.advantages_and_returns(
             "extrinsic", observations, episode.rewards, episode.terminated
         )
+        if self.records and self.ppo.unit("extrinsic") > 1e6 * unit:
+            logger.warning(
+                "%s: the rewards of episode %d are so large that others now count for a millionth",
+                *(self.config.environment, len(self.records) + 1),
+            )
         beta, bonus, intrinsic_scale = 0.0, None, 1.0
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
@@ -118,7 +128,8 @@ class Trainer:
             require_share("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
-            require_share("the curiosity bonus", reward, 1e-6, self.curiosity.largest)
+            largest = min(self.curiosity.largest, TOO_LARGE)
+            require_share("the curiosity bonus", reward, 1e-6, largest)
             reward = np.maximum(reward, 0.0)
             intrinsic_advantages, intrinsic_returns = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
@@ -195,6 +206,12 @@ class Trainer:
             require_finite(f"a weight of the {name}", adam.parameters)
         for item in rollout:
             self.ppo.normaliser.update(item.episode.observations[:-1])
+        if not self.diagnostics and (dimensions := unseen(self.ppo.normaliser)):
+            logger.warning(
+                "%s: differences in observation%s are below 1e-8, or below what float32 tells "
+                "apart, and are not learned from: use a smaller unit, or leave an offset out",
+                *(self.config.environment, dimensions),
+            )
         return update
 
     def state_dict(self) -> dict[str, Any]:

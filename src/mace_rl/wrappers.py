@@ -112,11 +112,11 @@ class CuriosityReward(Curious, gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        parts = self.appraisal.pay(0, action, float(reward), observation)
+        parts = self.appraisal.pay(0, action, reward, observation)
         if terminated or truncated:
             self.appraisal.end(0, bool(terminated))
         total = parts["reward_extrinsic"] + parts["reward_curiosity"]
-        return observation, total, terminated, truncated, {**info, **parts}
+        return observation, total, terminated, truncated, {**(info or {}), **parts}
 
 
 # Gymnasium's class takes no types as arguments before its version 1.3.
@@ -151,7 +151,7 @@ class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper):
         fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
         values = np.zeros((len(PARTS), self.num_envs))
         for i in np.flatnonzero(~fresh).tolist():
-            parts = self.appraisal.pay(i, actions[i], float(rewards[i]), reached[i])
+            parts = self.appraisal.pay(i, actions[i], rewards[i], reached[i])
             values[:, i] = list(parts.values())
         for i in np.flatnonzero(ended).tolist():
             self.appraisal.end(i, bool(terminated[i]))

@@ -147,7 +147,7 @@ class DictionaryModule(torch.nn.Module):
             "std": critic.normaliser.std,
         }
         for name, array in buffers.items():
-            self.register_buffer(name, torch.tensor(array))
+            self.register_buffer(name, torch.from_numpy(array.copy()))
 
     def forward(self, observations: Tensor) -> Tensor:
         """V of each state, [N, 1]; observations: as the policy's network sees them, [N, size]."""

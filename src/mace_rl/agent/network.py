@@ -5,6 +5,8 @@ the default one, a tanh network, in compiled code. Whoever holds a network sees 
 parameters, outputs, and gradients, and cannot tell which it is.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
@@ -196,7 +198,7 @@ def custom_module(
     Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
     are not [N, outputs] or not the same twice: such a run would not resume to the bit.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), as_torch_begins():
         torch.manual_seed(int(generator.integers(2**63)))
         module = make(
             settings.module,
@@ -217,6 +219,18 @@ def custom_module(
         if found:
             raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
     return module.float()
+
+
+@contextmanager
+def as_torch_begins() -> Iterator[None]:
+    """New tensors are float32 on the CPU, whatever the program or the user's module has set."""
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)
 
 
 def mlp(
@@ -240,7 +254,7 @@ def mlp(
 def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
     """The layers of `mlp`, with weights that mean nothing."""
     generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-    linear = [torch.nn.Linear(*pair) for pair in pairwise(sizes)]
+    linear = [torch.nn.Linear(*pair, device="cpu", dtype=torch.float32) for pair in pairwise(sizes)]
     torch.set_rng_state(generator)
     layers = [part for one in linear for part in (one, torch.nn.Tanh())]
     return torch.nn.Sequential(*layers[:-1])

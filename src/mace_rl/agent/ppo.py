@@ -17,6 +17,7 @@ from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
 from mace_rl.config.agent import PPOConfig
+from mace_rl.finite import require_finite
 
 TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
@@ -216,6 +217,7 @@ class PPO:
             rewards, values, self.config.discount, self.config.gae_lambda
         )
         self.advantage_scales[kind].update(advantages)
+        require_finite(f"an advantage or value of the {kind} reward", advantages)
         return advantages, advantages + values[:-1]
 
     def reward_scale(self, kind: str) -> float:
@@ -225,6 +227,10 @@ class PPO:
     def advantage_scale(self, kind: str) -> float:
         """What advantages of one kind are divided by before β weighs them."""
         return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
+
+    def unit(self, kind: str) -> float:
+        """What was paid for an advantage of 1 where β weighs it."""
+        return self.reward_scale(kind) * self.advantage_scale(kind)
 
     def update(self, batch: Batch) -> Update:
         """K epochs over `batch`.

@@ -27,8 +27,8 @@ class MaskedAutoencoder(torch.nn.Module):
         layers = mlp([size, hidden_units, 2 * size], 0.1, generator)
         self.hidden, self.output = (part for part in layers if isinstance(part, torch.nn.Linear))
         # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
-        degrees = torch.arange(hidden_units) % max(size - 1, 1) + 1
-        coordinates = torch.arange(1, size + 1)
+        degrees = torch.arange(hidden_units, device="cpu") % max(size - 1, 1) + 1
+        coordinates = torch.arange(1, size + 1, device="cpu")
         inward = degrees[:, None] >= coordinates
         outward = (coordinates[:, None] > degrees).repeat(2, 1)
         self.masks = inward.float(), outward.float()

@@ -71,8 +71,8 @@ class HashCounts(IntrinsicReward):
             "matrix": torch.from_numpy(self.matrix.copy()),
             "normaliser": self.normaliser.state_dict(),
             "early": torch.from_numpy(self.early.copy()),
-            "codes": torch.tensor(list(self.counts), dtype=torch.int64),
-            "counts": torch.tensor(list(self.counts.values()), dtype=torch.int64),
+            "codes": torch.from_numpy(np.array(list(self.counts), np.int64)),
+            "counts": torch.from_numpy(np.array(list(self.counts.values()), np.int64)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

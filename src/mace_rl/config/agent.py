@@ -2,9 +2,9 @@
 
 from typing import Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Arguments, Reference, Section
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class CompiledNetwork(Section):
@@ -37,8 +37,8 @@ class DictionaryValue(Section):
     """A critic that is a dictionary of states and returns (Pritzel et al. 2017)."""
 
     kind: Literal["dictionary"]
-    capacity: PositiveInt  # states
-    neighbours: PositiveInt  # k, whose returns make a value
+    capacity: Count  # states
+    neighbours: Count  # k, whose returns make a value
     kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
     learning_rate: PositiveFloat = Field(le=1)  # α, at which a remembered state's return moves
 
@@ -63,16 +63,16 @@ class PPOConfig(Section):
     actor_learning_rate: PositiveFloat = Field(lt=1)
     critic_learning_rate: PositiveFloat = Field(lt=1)
     discount: float = Field(ge=0, le=1)  # γ
-    epochs: PositiveInt  # K, passes over the rollout at each update
+    epochs: Count  # K, passes over the rollout at each update
     clip: PositiveFloat = Field(lt=1)  # ε
     gae_lambda: float = Field(ge=0, le=1)  # λ; 1 is the Monte Carlo return minus the baseline
     entropy_coefficient: NonNegativeFloat
     # An update follows the first episode end at which this many steps have been collected, so 1
     # is one update per episode. Rollouts are whole episodes: β belongs to an episode.
-    rollout_steps: PositiveInt
-    minibatch_size: PositiveInt | None  # None: the whole rollout is one batch
+    rollout_steps: Count
+    minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
-    hidden_units: list[PositiveInt] = Field(min_length=1)
+    hidden_units: list[Units] = Field(min_length=1)
     critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat

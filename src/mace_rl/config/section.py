@@ -6,7 +6,7 @@ import re
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.types import JsonValue
 from pydantic_core import ErrorDetails
 
@@ -25,6 +25,11 @@ class Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=()
     )
+
+
+# A number of things, for all of which there may have to be room at once.
+Count = Annotated[int, Field(gt=0, le=10**7)]
+Units = Annotated[int, Field(gt=0, le=10**4)]  # in a layer of a network
 
 
 def _reference(text: str) -> str:

@@ -41,7 +41,7 @@ class PolicyModule(torch.nn.Module):
         mean, std, clip = ppo.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
-        self.register_buffer("clip", torch.tensor(clip, dtype=torch.float64))
+        self.register_buffer("clip", torch.from_numpy(np.array(clip)))
 
     def forward(self, observations: Any) -> Distribution:
         """The distribution over actions in each state; observations: one, or a batch of them.

@@ -81,7 +81,10 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _take(self) -> None:
         try:
-            drawn = Image.fromarray(np.asarray(self.env.render(), np.uint8))
+            rendered = self.env.render()
+            if rendered is None:
+                raise TypeError("render() gives no picture")
+            drawn = Image.fromarray(np.asarray(rendered, np.uint8))
         except Exception as error:  # renderers fail by many types: no display, no library, a bug
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise RenderError(f"environment {self.name!r} cannot be drawn: {reason}") from error
