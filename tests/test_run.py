@@ -467,12 +467,12 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
 ):
     """By a replay of the last episodes, which changes nothing."""
     name = kind if "-v" in kind else register("Draws-v0", Draws, 5, kind=kind)
-    config = run_config(name, "ppo", 0, episodes=18, max_episode_steps=60 if "-v" in kind else 5)
+    config = run_config(name, "ppo", 0, episodes=30, max_episode_steps=60 if "-v" in kind else 5)
     checkpoint_every(1)
     for folder in ("killed", "whole"):
         seed_all(1)
         if folder == "killed":
-            kill(17, config, tmp_path / folder)
+            kill(29, config, tmp_path / folder)
             seed_all(2)  # another process
         run.run(config, tmp_path / folder)
     (interruption,) = provenance_of(tmp_path / "killed")["interruptions"]

@@ -60,7 +60,7 @@ class Trainer:
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
-        self.last_episodes: list[dict[str, Any]] = []
+        self.last_episodes = resuming.LastEpisodes()
 
     def run(self) -> Iterator[list[EpisodeRecord]]:
         """Train to the last episode; yields the records of each round after its update.
@@ -97,9 +97,9 @@ class Trainer:
         wanted = self.config.ppo.rollout_steps
         while collected < wanted and len(self.records) < self.config.episodes:
             noise = draw_noise(self.environment, self.noise)
-            start = resuming.state_of(self.environment)
+            self.last_episodes.begin(self.environment)
             episode = self.play(self.environment, policy, noise)
-            self.last_episodes = resuming.remember(self.last_episodes, start, episode)
+            self.last_episodes.end(episode)
             rollout.append(self.appraise(episode))
             collected += len(episode)
         return rollout
@@ -217,7 +217,7 @@ class Trainer:
             "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
             "environment": resuming.state_of(self.environment),
-            "last_episodes": self.last_episodes,
+            "last_episodes": self.last_episodes.blocks,
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
             "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }
@@ -230,7 +230,7 @@ class Trainer:
             self.controller.load_state_dict(state["controller"])
         self.noise.bit_generator.state = state["noise"]
         resuming.set_state(self.environment, state["environment"])
-        self.last_episodes = state["last_episodes"]
+        self.last_episodes.blocks = state["last_episodes"]
         self.records = as_rows(EpisodeRecord, state["records"])
         self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
 

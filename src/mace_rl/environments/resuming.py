@@ -2,6 +2,7 @@
 
 import copy
 import hashlib
+import itertools
 import random
 from typing import Any
 
@@ -11,22 +12,24 @@ import torch
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 
-EPISODES, STEPS = 10, 1000  # at most that are played again, one however long
+EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
 OFFERED = "load_state_dict"  # by an environment, beside `state_dict`
 
 
-def state_of(environment: Environment) -> dict[str, Any]:
-    """All that can be known of what the next episode depends on: generators, those of the process
-    too, and what the environment's own `state_dict()` says, if it has one.
+def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
+    """All that can be known of what the next episode depends on: the environment's generator, what
+    its own `state_dict()` says if it has one, and the generators `of_process`, which takes longer.
     """
     inner: Any = environment.env.unwrapped
-    return {
+    state = {
         "np_random": _plain(environment.generator.bit_generator.state),
         "own": copy.deepcopy(inner.state_dict()) if hasattr(inner, OFFERED) else None,
-        "random": random.getstate(),
-        "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002
-        "torch": torch.get_rng_state(),
     }
+    if of_process:
+        state["random"] = random.getstate()
+        state["numpy"] = _plain(np.random.get_state(legacy=False))  # noqa: NPY002
+        state["torch"] = torch.get_rng_state()
+    return state
 
 
 def set_state(environment: Environment, state: dict[str, Any]) -> None:
@@ -35,31 +38,42 @@ def set_state(environment: Environment, state: dict[str, Any]) -> None:
     if state["own"] is not None:
         inner.load_state_dict(copy.deepcopy(state["own"]))
     environment.generator.bit_generator.state = state["np_random"]
-    random.setstate(state["random"])
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    torch.set_rng_state(state["torch"])
+    if "random" in state:
+        random.setstate(state["random"])
+        np.random.set_state(state["numpy"])  # noqa: NPY002
+        torch.set_rng_state(state["torch"])
 
 
-def remember(
-    earlier: list[dict[str, Any]], start: dict[str, Any], episode: Episode
-) -> list[dict[str, Any]]:
-    """The last episodes, this one too, for `replay_differs`: state at the start, actions, outcome.
+class LastEpisodes:
+    """The last episodes: the state before each, its actions, and what came of them.
 
-    start: what `state_of` returned before it. A few episodes, of `STEPS` together: they are small.
+    They are in two blocks. The generators of the process are saved before the first of a block.
     """
-    actions = torch.from_numpy(episode.actions)
-    kept = [*earlier, {"start": start, "actions": actions, "outcome": _digest(episode)}]
-    while len(kept) > EPISODES or sum(len(one["actions"]) for one in kept[:-1]) > STEPS:
-        del kept[0]
-    return kept
+
+    def __init__(self) -> None:
+        self.blocks: list[list[dict[str, Any]]] = [[]]
+        self.start: dict[str, Any] = {}
+
+    def begin(self, environment: Environment) -> None:
+        """An episode is to be played."""
+        block = self.blocks[-1]
+        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+            self.blocks = [block, []]
+        self.start = state_of(environment, of_process=not self.blocks[-1])
+
+    def end(self, episode: Episode) -> None:
+        """It has been played."""
+        actions = torch.from_numpy(episode.actions)
+        one = {"start": self.start, "actions": actions, "outcome": _digest(episode)}
+        self.blocks[-1].append(one)
 
 
-def replay_differs(environment: Environment, last: list[dict[str, Any]]) -> str:
+def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
     """How a fresh environment, given their actions again, plays episodes otherwise; "" if not.
 
-    What it kept from them for later it then has kept again.
+    blocks: of `LastEpisodes`. What it kept from them for later it then has kept again.
     """
-    for one in last:
+    for one in itertools.chain.from_iterable(blocks):
         set_state(environment, one["start"])
         try:
             episode = roll_out(environment, _Again(), one["actions"].numpy())
