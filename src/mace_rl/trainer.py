@@ -37,6 +37,7 @@ from mace_rl.experience import (
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
 from mace_rl.finite import NonFiniteError, require_finite, require_share
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
 
@@ -76,7 +77,7 @@ class Trainer:
                 update = self.improve(rollout)
                 done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
                 self.diagnostics.append(diagnose(done, rollout, update, credit))
-            except Exception as error:
+            except (Exception, SystemExit, GeneratorExit) as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
                 played = len(self.records)
                 where = (
@@ -84,6 +85,8 @@ class Trainer:
                 )
                 if isinstance(error, NonFiniteError):
                     raise NonFiniteError(f"{run}, {where}: {error}") from None
+                if not isinstance(error, Exception):
+                    raise Refusal(f"{run}, {where}: code raised {error!r}") from error
                 error.add_note(f"in {run}, {where}")
                 raise
             yield self.records[start:]

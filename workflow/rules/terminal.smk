@@ -54,9 +54,39 @@ def in_short(record):
         last = [line for log in logs for line in log.read_text(errors="replace").splitlines()[-1:]]
         said = [record.rule_msg, *(f"its log ends: {line}" for line in last)]
         record.rule_msg = "; ".join(filter(None, said)) or "it has no log"
+    elif str(record.msg).startswith(LAST) and workflow.is_main_process and not workflow.dryrun:
+        record.msg = f"{record.msg}\n{outcome()}"
     return True
 
 
+def outcome():
+    """Table 1, if it is among what was asked for, and where all of this lies."""
+    made = {str(path) for job in workflow.dag.jobs for path in job.output}
+    asked = {str(path) for job in workflow.dag.targetjobs for path in job.output}
+    lines = []
+    if f"{RESULTS}/table1.csv" in made:
+        from mace_rl.results import pages, renderings, tables  # pandas takes as long as planning
+
+        found = {name: f"{RESULTS}/{name}.csv" for name in ("metrics", "table1")}
+        data, _ = pages.read_data(found, TRAININGS, MEASURED)
+        table = tables.table1(tables.named(data["table1"], study.labels))
+        lines = [f"\n{TITLE}\n", renderings.plain(table), ""]
+    kinds = {what: {f"{RESULTS}/{name}" for name in names} & made for what, names in KINDS.items()}
+    kinds["others"] = asked.difference(*kinds.values())
+    lines += [f"{what + ':':9}{', '.join(sorted(kinds[what]))}" for what in kinds if kinds[what]]
+    if f"{RESULTS}/tables.md" in made and not kinds["report"]:
+        lines.append(f"report:  {COMMAND.replace('all', 'page', 1)}")
+    return "\n".join(lines)
+
+
+TITLE = "Table 1: sample efficiency / convergence steps in episodes; * is the lowest"
+KINDS = {
+    "figures": ["figure1.pdf", "figure2.pdf"],
+    "tables": ["table1.tex", "table2.tex", "tables.md"],
+    "claims": ["claims.md"],
+    "report": ["report.html"],
+}
+LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
 
 
@@ -88,6 +118,8 @@ onstart:
 
 
 onsuccess:
+    global LAST
+    LAST += ("Elapsed time: ",)
     for folder in {Path(episodes).parent for episodes in EPISODES}:
         # Not of an unfinished run, which was not asked for this time.
         if (folder / files.RECORD).exists():

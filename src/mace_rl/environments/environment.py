@@ -4,7 +4,7 @@ import copy
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
@@ -16,6 +16,7 @@ from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
+from mace_rl.outlets import keep_open
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
@@ -24,8 +25,10 @@ FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv
 @contextmanager
 def nothing_printed() -> Iterator[None]:
     """Keep off the terminal what pybullet prints, from C, when it is loaded and connected."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
+        keep_open(descriptor)
+        with suppress(AttributeError, OSError):  # it is None, or its reader is gone
+            stream.flush()
     kept = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]
     with open(os.devnull, "w") as nowhere:
         for descriptor, _ in kept:
