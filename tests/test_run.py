@@ -243,6 +243,23 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
     timer.join()
 
 
+def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    asleep, wake = os.pipe()
+    with run.exclusive(tmp_path):
+        worker = os.fork()
+        if not worker:
+            os.close(wake)
+            os.read(asleep, 1)
+            os._exit(0)
+        with pytest.raises(run.RunError), run.exclusive(tmp_path):
+            pass
+    with run.exclusive(tmp_path):
+        assert os.waitpid(worker, os.WNOHANG) == (0, 0)  # it lives
+    os.close(wake)
+    os.waitpid(worker, 0)
+
+
 @pytest.mark.parametrize(
     ("file", "time", "left", "after"),
     [("run.json", 1, [*UNFINISHED, *OUTCOME], 6), ("checkpoint.pt", 5, UNFINISHED, 4)],

@@ -274,7 +274,8 @@ def main() -> None:
         resumes = arguments.command == "train"
         logger.info("interrupted%s", "; the same command resumes it" if resumes else "")
         sys.exit(130)
-    unseen = getattr(getattr(sys.stdout.buffer, "raw", None), "error", None)
+    buffer = getattr(sys.stdout, "buffer", None)
+    unseen = getattr(getattr(buffer, "raw", None), "error", None)
     if unseen and arguments.command != "train":  # which shows nothing but how far it is
         sys.exit(f"mace-rl: standard output: {unseen.strerror}")
 
