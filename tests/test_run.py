@@ -8,6 +8,7 @@ import logging
 import os
 import pickle
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -241,6 +242,28 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
     with run.exclusive(tmp_path):
         assert time.monotonic() - started >= 0.4
     timer.join()
+
+
+JOB = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from job import job
+with job("it", "log"):
+    raise eval(sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ends", "closed"), [("SystemExit(0)", ""), ("GeneratorExit()", ">&- 2>&-")]
+)
+def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
+    scripts = Path(__file__).parents[1] / "workflow" / "scripts"
+    command = shlex.join([sys.executable, "-c", JOB, str(scripts), ends])
+    assert subprocess.run(["sh", "-c", f"{command} {closed}"], cwd=tmp_path).returncode == 1
+    assert (
+        f" it failed: {ends.partition('(')[0]}" in (tmp_path / "log").read_text().splitlines()[-1]
+    )
 
 
 def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):

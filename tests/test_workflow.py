@@ -130,7 +130,7 @@ def test_everything_is_made_and_the_terminal_says_how_far_it_is(finished: Projec
     for output in (terminal, file):
         shown = output.partition("Table 1: ")[2].splitlines()
         assert shown[2].split() == ["Algorithm", *sorted(ENVIRONMENTS)]
-        assert max(map(len, shown)) <= 100 and "tables:  results/table1.tex" in shown[7]
+        assert max(map(len, shown)) <= 100 and "results/table1.tex" in shown[7]
     assert finished("mace-rl status results") == (0, "6 of 6 runs done\n")
     logs = [*finished["results/logs"].rglob("*.log")]
     assert len(logs) == len(RUNS) + sum(EVALUATION.values()) + 1  # Table 2

@@ -69,27 +69,19 @@ def outcome():
 
         from mace_rl.results import renderings, tables
 
-        names = {"env": str, "variant": str}  # NA, too, is a name
-        data = pandas.read_csv(
-            f"{RESULTS}/table1.csv", dtype=names, keep_default_na=False, na_values=[""]
-        )
+        names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
+        data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
         table = tables.table1(tables.named(data, study.labels))
         lines = [f"\n{TITLE}\n", renderings.plain(table), ""]
-    kinds = {what: {f"{RESULTS}/{name}" for name in names} & made for what, names in KINDS.items()}
-    kinds["others"] = asked.difference(*kinds.values())
-    lines += [f"{what + ':':9}{', '.join(sorted(kinds[what]))}" for what in kinds if kinds[what]]
-    if f"{RESULTS}/tables.md" in made and not kinds["report"]:
-        lines.append(f"report:  {COMMAND.replace('all', 'page', 1)}")
+    lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
+    lines += textwrap.wrap(", ".join([*lie, *sorted(asked.difference(lie))]), 100)
+    if f"{RESULTS}/tables.md" in made and f"{RESULTS}/report.html" not in made:
+        lines.append(f"All of it on one page: {COMMAND.replace('all', 'page', 1)}")
     return "\n".join(lines)
 
 
-TITLE = "Table 1: sample efficiency / convergence steps in episodes; *: the lowest; †k: k seeds never got there"
-KINDS = {
-    "figures": ["figure1.pdf", "figure2.pdf"],
-    "tables": ["table1.tex", "table2.tex", "tables.md"],
-    "claims": ["claims.md"],
-    "report": ["report.html"],
-}
+TITLE = "Table 1: sample efficiency / convergence steps in episodes; *: lowest; †k: k seeds never get there"
+SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
 LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
 

@@ -28,12 +28,10 @@ def job(title: str, log: str) -> Iterator[None]:
     # Without this a training goes on unseen when Snakemake is killed.
     if "MACE_RL_SNAKEMAKE_PID" in os.environ:
         threading.Thread(target=_end_with_snakemake, daemon=True).start()
-    for descriptor in (0, 1, 2):
-        outlets.keep_open(descriptor)  # or the log gets their numbers
+    outlets.secure()  # or the log gets the number of one that is closed
     with open(log, "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    outlets.secure()
     logging.basicConfig(
         stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(message)s", force=True
     )
