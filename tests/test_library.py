@@ -143,19 +143,19 @@ def test_the_readme_s_example(monkeypatch, tmp_path):
 
 def test_without_a_folder_for_caches_a_temporary_one_serves(tmp_path, monkeypatch, caplog):
     """numba runs what it finds there."""
-    folders, numbas_own = [], numba.njit
+    folders = []
 
     def njit(**options):
         folders.append(compiling.config.CACHE_DIR)
         if len(folders) == 1:
             raise RuntimeError("cannot cache function 'f': no locator available for file 'f.py'")
-        return numbas_own()
+        return lambda function: function
 
     monkeypatch.setattr(numba, "njit", njit)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     compiling.spare_folder.cache_clear()
     before = compiling.config.CACHE_DIR
-    assert compiling.njit(cache=True)(lambda x: x + 1)(1) == 2
+    assert compiling.njit(cache=True)(abs) is abs
     (own,) = tmp_path.iterdir()
     assert folders[1] == str(own / compiling.FOLDER.name) and before == compiling.config.CACHE_DIR
     assert len(caplog.messages) == 1 and str(own) in caplog.text
