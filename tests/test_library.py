@@ -7,19 +7,22 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from importlib.metadata import requires, version
 from pathlib import Path
 
 import gymnasium
+import numba
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from shared import call
 
 import mace_rl
-from mace_rl import load_agent, settings, train
+from mace_rl import compiling, load_agent, settings, train
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import read_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -178,3 +181,27 @@ def test_the_readme_s_example(monkeypatch, tmp_path):
     names: dict = {}
     exec(example.replace("episodes=200", "episodes=4"), names)
     assert len(names["episodes"]) == 4
+
+
+def test_without_a_folder_for_caches_a_temporary_one_serves(tmp_path, monkeypatch, caplog):
+    """numba runs what it finds there."""
+    folders = []
+
+    def njit(**options):
+        folders.append(compiling.config.CACHE_DIR)
+        if len(folders) == 1:
+            raise RuntimeError("cannot cache function 'f': no locator available for file 'f.py'")
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", njit)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    compiling.spare_folder.cache_clear()
+    before = compiling.config.CACHE_DIR
+    assert compiling.njit(cache=True)(abs) is abs
+    (own,) = tmp_path.iterdir()
+    assert folders[1] == str(own / compiling.FOLDER.name) and before == compiling.config.CACHE_DIR
+    assert len(caplog.messages) == 1 and str(own) in caplog.text
+    own.chmod(0o770)
+    compiling.spare_folder.cache_clear()
+    with pytest.raises(Refusal, match="is not this user's alone: let NUMBA_CACHE_DIR name"):
+        compiling.spare_folder()

@@ -9,6 +9,7 @@ import os
 import pickle
 import random
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -267,6 +268,45 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
     with run.exclusive(tmp_path):
         assert time.monotonic() - started >= 0.4
     timer.join()
+
+
+JOB = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from job import job
+with job("it", "log"):
+    raise eval(sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ends", "closed"), [("SystemExit(0)", ""), ("GeneratorExit()", ">&- 2>&-")]
+)
+def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
+    scripts = Path(__file__).parents[1] / "workflow" / "scripts"
+    command = shlex.join([sys.executable, "-c", JOB, str(scripts), ends])
+    assert subprocess.run(["sh", "-c", f"{command} {closed}"], cwd=tmp_path).returncode == 1
+    assert (
+        f" it failed: {ends.partition('(')[0]}" in (tmp_path / "log").read_text().splitlines()[-1]
+    )
+
+
+def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    asleep, wake = os.pipe()
+    with run.exclusive(tmp_path):
+        worker = os.fork()
+        if not worker:
+            os.close(wake)
+            os.read(asleep, 1)
+            os._exit(0)
+        with pytest.raises(run.RunError), run.exclusive(tmp_path):
+            pass
+    with run.exclusive(tmp_path):
+        assert os.waitpid(worker, os.WNOHANG) == (0, 0)  # it lives
+    os.close(wake)
+    os.waitpid(worker, 0)
 
 
 @pytest.mark.parametrize(

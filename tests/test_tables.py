@@ -37,6 +37,7 @@ from mace_rl.results.renderings import (
     latex_cell,
     markdown,
     number,
+    plain,
 )
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
@@ -247,6 +248,7 @@ def test_a_cell_in_each_rendering() -> None:
     assert markdown(frame).splitlines()[2] == (
         r"| a & b\|c | **−2†1** / 5 (−3 to 4 / – to –); paper: <7> |"
     )
+    assert plain(frame) == "          x<y\na & b|c   −2†1* / 5"
     html = as_html(frame)
     assert '<td class="left">a &amp; b|c</td>' in html and "<th>x&lt;y</th>" in html
     assert '<span class="nowrap best">−2<sup>†1</sup></span> / ' in html

@@ -3,6 +3,7 @@
 import io
 import math
 from pathlib import Path
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -18,6 +19,7 @@ from mace_rl.config.reading import merge
 from mace_rl.config.study import read_study
 from mace_rl.experience import Experience
 from mace_rl.numerics.finite import NonFiniteError
+from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
@@ -513,3 +515,13 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, part, message, place
         spoil(np.nan)
     with pytest.raises(NonFiniteError, match=f"CartPole-v1 mace_full seed 0, {message}"):
         finish(trainer)
+
+
+@pytest.mark.parametrize("ends", [SystemExit(0), SystemExit("why"), GeneratorExit()], ids=repr)
+def test_code_that_ends_the_program_is_an_error(run_config, register, monkeypatch, ends):
+    name = register("Bonanza-v0", Bonanza, 5)
+    trainer = Trainer(run_config(name, "ppo", 3, episodes=9))
+    monkeypatch.setattr(Bonanza, "step", Mock(side_effect=ends))
+    with pytest.raises(Refusal, match="ppo seed 3, episode 1: code raised") as refused:
+        list(trainer.run())
+    assert repr(ends) in str(refused.value)

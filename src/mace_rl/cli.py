@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mace_rl import files
+from mace_rl import files, outlets
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.config.study import folder_of
@@ -255,6 +255,7 @@ def verify(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
+    outlets.secure()
     arguments = parser().parse_args()
     commands = {
         "train": train,
@@ -277,11 +278,17 @@ def main() -> None:
             raise
         extra = "tensorboard" if arguments.command == "tensorboard" else "study"
         sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
+    except SystemExit as error:  # a module of the user's own, where it is imported or made
+        sys.exit(f"mace-rl: code of the environment or of a plugin ended the program: {error!r}")
     except KeyboardInterrupt:
         resumes = "; the same command resumes it" if arguments.command == "train" else ""
         without = ", without --restart" if getattr(arguments, "restart", False) else ""
         logger.info("interrupted%s%s", resumes, without)
         sys.exit(130)
+    buffer = getattr(sys.stdout, "buffer", None)
+    unseen = getattr(getattr(buffer, "raw", None), "error", None)
+    if unseen and arguments.command != "train":  # which shows nothing but how far it is
+        sys.exit(f"mace-rl: standard output: {unseen.strerror}")
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ class Trainer:
                 update = self.improve(rollout)
                 done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
                 self.diagnostics.append(diagnose(done, rollout, update, credit))
-            except Exception as error:
+            except (Exception, SystemExit, GeneratorExit) as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
                 played = len(self.records)
                 where = (
@@ -85,6 +85,8 @@ class Trainer:
                 )
                 if isinstance(error, Refusal):
                     raise type(error)(f"{run}, {where}: {error}") from error.__cause__
+                if not isinstance(error, Exception):
+                    raise Refusal(f"{run}, {where}: code raised {error!r}") from error
                 error.add_note(f"in {run}, {where}")
                 raise
             yield self.records[start:]

@@ -5,7 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
@@ -17,6 +17,7 @@ from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError, short
 from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces, require_vectors
+from mace_rl.outlets import keep_open
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
@@ -26,8 +27,10 @@ MOST_STEPS = 10**6  # of an episode: before it, noise is drawn for as many
 @contextmanager
 def nothing_printed() -> Iterator[None]:
     """Keep off the terminal what pybullet prints, from C, when it is loaded and connected."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
+        keep_open(descriptor)
+        with suppress(AttributeError, OSError):  # it is None, or its reader is gone
+            stream.flush()
     kept = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]
     with open(os.devnull, "w") as nowhere:
         for descriptor, _ in kept:

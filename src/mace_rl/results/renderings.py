@@ -1,4 +1,4 @@
-"""A table as Markdown, HTML and LaTeX: three renderings of one frame of cells (`tables`)."""
+"""A table as Markdown, HTML, LaTeX and plain text: renderings of one frame of cells (`tables`)."""
 
 import html
 from collections.abc import Sequence
@@ -75,6 +75,24 @@ def _markdown(cell: str | Cell) -> str:
     intervals = [f"{one.low} to {one.high}" for one in cell.values if one.low]
     interval = f" ({cell.joint.join(intervals)})" if intervals else ""
     return cell.joint.join(texts) + interval + (f"; {cell.note}" if cell.note else "")
+
+
+def plain(frame: pd.DataFrame) -> str:
+    """A table for the terminal, without intervals; the best have a star."""
+    head, *names = frame.columns
+    blocks = []
+    for start in range(0, len(names), COLUMNS_PER_BLOCK):
+        part = frame[[head, *names[start : start + COLUMNS_PER_BLOCK]]]
+        rows = [list(part.columns), *([_plain(cell) for cell in row] for row in part.to_numpy())]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        blocks.append("\n".join("   ".join(map(str.ljust, row, widths)).rstrip() for row in rows))
+    return "\n\n".join(blocks)
+
+
+def _plain(cell: str | Cell) -> str:
+    if isinstance(cell, str):
+        return cell
+    return cell.joint.join(f"{one.text}{one.mark}{'*' if one.best else ''}" for one in cell.values)
 
 
 def as_html(frame: pd.DataFrame) -> str:

@@ -261,16 +261,15 @@ def left_alone() -> Iterator[None]:
 def exclusive(directory: Path) -> Iterator[int]:
     """Hold the run's folder for this process, by a file; the lock goes with the process."""
     # A file of its own: a folder on a network's disk can be locked by two machines at once.
-    descriptor = os.open(directory / files.LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
+    with open(directory / files.LOCK, "ab") as file:
+        # A copy in an environment's worker would hold it when the training has ended.
+        os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
-        while not locked(descriptor):
+        while not locked(file.fileno()):
             if time.monotonic() > patience:
                 raise RunError(f"{directory}: another process is training in this folder")
             time.sleep(0.1)
-        yield descriptor
-    finally:
-        os.close(descriptor)
+        yield file.fileno()
 
 
 def locked(descriptor: int) -> bool:
