@@ -261,7 +261,7 @@ def left_alone() -> Iterator[None]:
 def exclusive(directory: Path) -> Iterator[int]:
     """Hold the run's folder for this process, by a file; the lock goes with the process."""
     # A file of its own: a folder on a network's disk can be locked by two machines at once.
-    with open(directory / files.LOCK, "ab") as file:
+    with open(directory / files.LOCK, "a+b") as file:
         # A copy in an environment's worker would hold it when the training has ended.
         os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
