@@ -86,7 +86,9 @@ def make(
         inspect.signature(factory).bind(*given, **arguments)
     except TypeError as error:
         raise ConfigError(f"{key} has {reference!r} with {arguments}: {error}") from None
-    return factory(*given, **arguments)
+    if not isinstance(made := factory(*given, **arguments), kind):
+        raise ConfigError(f"{key} has {reference!r}, which returned {short(made)}")
+    return made
 
 
 def import_module(reference: str, key: str) -> ModuleType:
@@ -97,8 +99,8 @@ def import_module(reference: str, key: str) -> ModuleType:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError(f"{module!r} is no module's name")
         return importlib.import_module(module)
-    except ImportError as error:
-        reason = " ".join(str(error).split())
+    except (ImportError, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
 
 

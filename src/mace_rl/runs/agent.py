@@ -127,8 +127,9 @@ def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:
         if found != right:
             raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
         bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
+        bad |= (state[name] <= 0) & (name in ("policy.std", "policy.clip"))
         if bad.any():
-            raise CheckpointError(f"{path}: {name} has NaN or Inf in it")
+            raise CheckpointError(f"{path}: {name} has NaN or Inf in it, or is not positive")
     agent.load_state_dict(state)
     return trainer, agent
 
@@ -136,5 +137,5 @@ def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:
 def _kind(entry: Any) -> str:
     """What an entry of a state is, without its values."""
     if isinstance(entry, Tensor):
-        return f"{entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
+        return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
     return "missing" if entry is None else f"a {type(entry).__name__}"

@@ -46,7 +46,8 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
                 raise ValueError("it is compressed")
         return dict(torch.load(io.BytesIO(data), weights_only=True))
     except Exception as error:  # torch reports damage by many types
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        # Of PyTorch's advice to trust it, with colours, not more than the first sentence.
+        reason = str(error).splitlines()[0].partition(". ")[0] if str(error) else repr(error)
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
 
 
@@ -85,5 +86,5 @@ def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") 
             if old != new:
                 return difference(old, new, f"{name}.")
         elif old != new:
-            return f"{name} was {old!r} and is {new!r}"
+            return f"{name} was {short(old)} and is {short(new)}"
     return "no difference"

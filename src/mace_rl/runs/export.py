@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl import files
+from mace_rl.config.plugins import config_of_run
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 from mace_rl.results.records import RecordError
@@ -29,7 +30,8 @@ def columns(folder: Path) -> dict[str, list[Any]]:
     seen: dict[tuple[Any, ...], Path] = {}
     for run in files.runs_below(folder, [files.RECORD]):
         record, episodes = read_record(run / files.RECORD), run / files.EPISODES
-        key = tuple(record["config"][name] for name in ("environment", "variant", "seed"))
+        config = config_of_run(record["config"], str(run / files.RECORD), trust=True)  # runs none
+        key = config.environment, config.variant, config.seed
         if key in seen:
             name = "{} {} seed {}".format(*key)
             raise RecordError(f"{run}: {name} is in {seen[key]} too; export one of them alone")

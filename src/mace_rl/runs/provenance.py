@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mace_rl import sources
+from mace_rl import files, sources
 from mace_rl.config.plugins import source_file
 from mace_rl.config.run import RunConfig
 from mace_rl.refusal import Refusal
@@ -27,7 +27,7 @@ PACKAGES = (
     "pybullet-envs-gymnasium",
 )
 # What every run.json has.
-KEYS = {"config", "versions", "sources", "machine", "outputs"}
+KEYS = {"config": dict, "versions": dict, "sources": str, "machine": dict, "outputs": dict}
 
 
 class GitError(Refusal, RuntimeError):
@@ -116,10 +116,11 @@ def machine() -> dict[str, Any]:
 def read_record(path: Path) -> dict[str, Any]:
     """A `run.json`; `ProvenanceError` if it is not whole."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        missing = KEYS - set(record)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
+        record = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ProvenanceError(f"{path}: not readable: {error}") from None
-    if missing:
-        raise ProvenanceError(f"{path}: the key {min(missing)!r} is missing")
+    wrong = [key for key, kind in KEYS.items() if not isinstance(record.get(key), kind)]
+    wrong = wrong or sorted({*files.RESULTS}.difference(record["outputs"]))
+    if wrong:
+        raise ProvenanceError(f"{path}: the key {wrong[0]!r} is missing or of another type")
     return record
