@@ -344,7 +344,7 @@ def test_a_part_that_is_not_of_its_space_is_refused(part):
     spaces = Spaces("Parts-v0", PARTS, Discrete(2))
     assert (spaces.encode(good) == [0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 1]).all()
     for given in (good | part, {"a": 1}):
-        with pytest.raises(ConfigError, match="Parts-v0.* after step 4, but its .* is Dict"):
+        with pytest.raises(ConfigError, match=r"Parts-v0.* after step 4, but its .* is Dict"):
             spaces.encode(given, 4)
 
 
