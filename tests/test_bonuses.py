@@ -74,7 +74,8 @@ def test_a_bonus_of_one_s_own(run_config):
 @pytest.mark.parametrize(
     ("bonus", "fragment"),
     [
-        ("{kind: rnd}", "in variant_settings.x, bonus is {'kind': 'rnd'}, but"),
+        ("{kind: rnb}", "in variant_settings.x, bonus is {'kind': 'rnb'}, but"),
+        ("{kind: rnd}", "'curiosity', 'custom', and extras/ has this one, as kind: custom"),
         ("{kind: curiosity, relevant: 3}", "unknown key 'bonus.relevant' (value 3); the nearest"),
         ("{kind: curiosity, relevance: 1}", "bonus.relevance is 1, but should be a valid boolean"),
         ("{kind: custom}", "the key 'bonus.estimator' is missing"),

@@ -38,9 +38,7 @@ def test_training_resumes_to_the_bit(run_config, environment, entry):
     next(interrupted.run())
     saved = io.BytesIO(archive(interrupted.state_dict()))
     resumed.load_state_dict(torch.load(saved, weights_only=True))
-    assert finish(resumed).records == whole.records
-    for name, found in resumed.ppo.learner.parameters.items():
-        assert (found == whole.ppo.learner.parameters[name]).all()
+    assert archive(finish(resumed).state_dict()) == archive(whole.state_dict())
 
 
 def test_the_page_names_every_plugin_and_readers_want_leave(trained, monkeypatch):
