@@ -37,7 +37,10 @@ def make_run(folder: Path, number: int, episodes: int = 30) -> None:
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (files.EPISODES, files.AGENT)
     }
-    record = {key: {} for key in KEYS} | {"outputs": digests, "config": {"episodes": episodes}}
+    record = {key: kind() for key, kind in KEYS.items()} | {
+        "outputs": digests,
+        "config": {"episodes": episodes},
+    }
     record["seconds"] = 10 * number
     (folder / files.RECORD).write_text(json.dumps(record))
 

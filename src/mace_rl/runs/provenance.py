@@ -122,7 +122,7 @@ def read_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ProvenanceError(f"{path}: not readable: {error}") from None
     wrong = [key for key, kind in KEYS.items() if not isinstance(record.get(key), kind)]
-    wrong = wrong or sorted({*files.RESULTS}.difference(record["outputs"]))
+    wrong = wrong or sorted({files.AGENT, files.EPISODES}.difference(record["outputs"]))
     if wrong:
         raise ProvenanceError(f"{path}: the key {wrong[0]!r} is missing or of another type")
     return record
