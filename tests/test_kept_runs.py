@@ -14,7 +14,7 @@ import pytest
 
 from mace_rl import files
 from mace_rl.results.records import rounded, write_episodes
-from mace_rl.runs.provenance import KEYS, file_digest
+from mace_rl.runs.provenance import file_digest
 from tools import kept_runs
 
 
@@ -37,7 +37,8 @@ def make_run(folder: Path, number: int, episodes: int = 30) -> None:
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (files.EPISODES, files.AGENT)
     }
-    record = {key: {} for key in KEYS} | {"outputs": digests, "config": {"episodes": episodes}}
+    config = {"environment": "A-v1", "variant": "ppo", "seed": number, "episodes": episodes}
+    record = {"config": config, "versions": {}, "sources": "", "machine": {}, "outputs": digests}
     record["seconds"] = 10 * number
     (folder / files.RECORD).write_text(json.dumps(record))
 
@@ -90,11 +91,11 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
     before = content(kept)
     records = (run / files.EPISODES).read_bytes()
     (run / files.EPISODES).write_bytes(records.replace(b"0", b"1"))
-    with pytest.raises(ValueError, match=r"episodes\.csv: not the file that run\.json describes"):
+    with pytest.raises(ValueError, match=r"episodes\.csv: missing, cut off or altered"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     (run / files.EPISODES).write_bytes(records)
     (run / files.AGENT).write_text("another")
-    with pytest.raises(ValueError, match=r"agent\.pt: not the file that run\.json describes"):
+    with pytest.raises(ValueError, match=r"agent\.pt: missing, cut off or altered"):
         kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     shutil.rmtree(run)
     make_run(run, 2)

@@ -372,7 +372,7 @@ def test_state_holds_all_that_the_rest_depends_on(run_config, environment, varia
     for one, other in zip(rest.diagnostics, whole.diagnostics, strict=True):
         np.testing.assert_equal(vars(one), vars(other))
     assert archive(rest.state_dict()) == archive(whole.state_dict())
-    assert archive(Agent(rest).state_dict()) == archive(Agent(whole).state_dict())
+    assert archive(Agent.of(rest).state_dict()) == archive(Agent.of(whole).state_dict())
 
 
 # --- Every kind of environment ------------------------------------------------------------------

@@ -1,14 +1,13 @@
 """The parts of a run, made as its settings ask for: what sets β, the bonus, PPO."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.custom import custom_module
-from mace_rl.agent.learner import Learner
 from mace_rl.agent.policy import Policy
 from mace_rl.agent.ppo import PPO
 from mace_rl.agent.torch_learner import TorchLearner
@@ -21,7 +20,7 @@ from mace_rl.bonus.hashing import HashCounts
 from mace_rl.bonus.icm import IntrinsicCuriosityModule
 from mace_rl.bonus.intrinsic import IntrinsicReward
 from mace_rl.bonus.rnd import RandomNetworkDistillation
-from mace_rl.config.agent import PPOConfig, TorchModule
+from mace_rl.config.agent import TorchModule
 from mace_rl.config.beta import (
     BanditBeta,
     BetaRule,
@@ -36,6 +35,7 @@ from mace_rl.config.bonus import CuriosityBonus, CustomBonus, HashCountsBonus, I
 from mace_rl.config.plugins import make
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.streams import Streams
@@ -95,9 +95,29 @@ def intrinsic_reward(
             return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 
-def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:
-    """Policy and critics, one for each kind of reward, and what trains them."""
-    settings, size = config.ppo, environment.observation_size
+def environment(config: RunConfig, streams: Streams) -> Environment:
+    """What the agent acts in."""
+    return Environment(
+        config.environment,
+        streams.sequence("environment"),
+        config.max_episode_steps,
+        config.environment_arguments,
+    )
+
+
+class ActorCritic(NamedTuple):
+    """Policy and critics, one for each kind of reward, and the learner that such networks have."""
+
+    policy: Policy
+    critics: dict[str, Any]
+    learner: type[CompiledLearner | TorchLearner]
+
+
+def actor_critic(
+    config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams
+) -> ActorCritic:
+    """The networks as training begins; intrinsic: with a critic of the curiosity bonus."""
+    settings, size = config.ppo, spaces.observation_size
     own = settings.network if isinstance(settings.network, TorchModule) else None
 
     def module(outputs: int, output_gain: float, stream: str) -> torch.nn.Module:
@@ -107,14 +127,25 @@ def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: S
         return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
 
     network: Callable[[Any], Any] = CompiledMLP
-    learner: Callable[[PPOConfig, Policy, Any], Learner] = CompiledLearner
+    learner: type[CompiledLearner | TorchLearner] = CompiledLearner
     if own is not None or config.engine == "torch":
         network, learner = TorchNetwork, TorchLearner
     # A small last layer starts near the uniform policy, or at means near 0.
-    actor = network(module(environment.action_size, 0.01, "actor"))
-    policy = Policy(actor, environment.action_space, settings.initial_log_std)
+    actor = network(module(spaces.action_size, 0.01, "actor"))
+    policy = Policy(actor, spaces.action_space, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
     critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
-    normaliser, generator = RunningNormaliser(size), streams["minibatches"]
-    trained = learner(settings, policy, critics)
-    return PPO(settings, policy, critics, trained, normaliser, generator)
+    return ActorCritic(policy, critics, learner)
+
+
+def ppo(config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
+    """Policy and critics, and what trains them."""
+    policy, critics, learner = actor_critic(config, spaces, intrinsic, streams)
+    return PPO(
+        config.ppo,
+        policy,
+        critics,
+        learner(config.ppo, policy, critics),
+        RunningNormaliser(spaces.observation_size),
+        streams["minibatches"],
+    )

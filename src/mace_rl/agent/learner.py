@@ -43,8 +43,9 @@ class Learner(Protocol):
 
     parameters: dict[str, np.ndarray]  # see `parameters_of`
 
-    def acting(self, normalisation: Normalisation) -> ActingPolicy:
-        """The policy for rollouts."""
+    @staticmethod
+    def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
+        """A policy of such networks for rollouts."""
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches

@@ -61,14 +61,14 @@ class PPO(Stateful):
 
         What leaves observations as they are if they are not to be normalised.
         """
-        if self.config.normalise_observations:
-            return self.normaliser.mean, self.normaliser.std, OBSERVATION_CLIP
-        size = len(self.normaliser.mean)
-        return np.zeros(size), np.ones(size), np.inf
+        normaliser = self.normaliser
+        if not self.config.normalise_observations:
+            return first_normalisation(self.config, len(normaliser.mean))
+        return normaliser.mean, normaliser.std, OBSERVATION_CLIP
 
     def acting_policy(self) -> ActingPolicy:
         """The current policy for a rollout."""
-        return self.learner.acting(Normalisation.of(*self.normalisation()))
+        return self.learner.acting(self.policy, Normalisation.of(*self.normalisation()))
 
     def advantages_and_returns(
         self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool
@@ -118,3 +118,9 @@ class PPO(Stateful):
         parts = math.ceil(count / size)
         ends = np.arange(1, parts + 1) * count // parts
         return Minibatches(shuffled(self.generator.random(shape)), ends)
+
+
+def first_normalisation(config: PPOConfig, size: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """`PPO.normalisation` as training begins, for observations of this size."""
+    clip = OBSERVATION_CLIP if config.normalise_observations else np.inf
+    return np.zeros(size), np.ones(size), clip
