@@ -375,6 +375,13 @@ def test_state_holds_all_that_the_rest_depends_on(run_config, environment, varia
     assert archive(Agent.of(rest).state_dict()) == archive(Agent.of(whole).state_dict())
 
 
+def test_equal_states_have_equal_bytes():
+    """Though in one of them two equal strings, or lists, are one object."""
+    texts = ["".join(("PCG", "64")) for _ in range(2)]
+    apart, together = {"a": texts, "b": [[1.5], [1.5]]}, {"a": [texts[0]] * 2, "b": [[1.5]] * 2}
+    assert archive(apart) == archive(together)
+
+
 # --- Every kind of environment ------------------------------------------------------------------
 
 ROOT = Path(__file__).parents[1]
