@@ -292,7 +292,7 @@ def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
 
 
 def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)  # which a fork may take
     asleep, wake = os.pipe()
     with run.exclusive(tmp_path):
         worker = os.fork()

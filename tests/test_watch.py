@@ -43,7 +43,8 @@ def test_what_is_filmed_is_what_evaluate_plays(trained, environment):
 
 def test_the_untrained_agent_has_the_weights_that_training_began_with(trained, run_config):
     config = run_config(episodes=2)
-    policy, env = Agent.of(Trainer(config)).policy, gymnasium.make("CartPole-v1")
+    trainer, env = Trainer(config), gymnasium.make("CartPole-v1")
+    policy = Agent(trainer.ppo, trainer.environment.given_space).policy
     env.reset(seed=5)
     observation, _ = env.reset()
     steps, ends = 0, [False]  # each pays 1

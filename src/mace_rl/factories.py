@@ -1,15 +1,16 @@
 """The parts of a run, made as its settings ask for: what sets β, the bonus, PPO."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.custom import custom_module
+from mace_rl.agent.learner import Learner
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import PPO
+from mace_rl.agent.ppo import PPO, ActorCritic
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.controls import RandomDraw, SlidingWindowBandit
@@ -105,18 +106,10 @@ def environment(config: RunConfig, streams: Streams) -> Environment:
     )
 
 
-class ActorCritic(NamedTuple):
-    """Policy and critics, one for each kind of reward, and the learner that such networks have."""
-
-    policy: Policy
-    critics: dict[str, Any]
-    learner: type[CompiledLearner | TorchLearner]
-
-
 def actor_critic(
     config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams
 ) -> ActorCritic:
-    """The networks as training begins; intrinsic: with a critic of the curiosity bonus."""
+    """Policy and critics, one for each kind of reward, as training begins with them."""
     settings, size = config.ppo, spaces.observation_size
     own = settings.network if isinstance(settings.network, TorchModule) else None
 
@@ -127,7 +120,7 @@ def actor_critic(
         return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
 
     network: Callable[[Any], Any] = CompiledMLP
-    learner: type[CompiledLearner | TorchLearner] = CompiledLearner
+    learner: type[Learner] = CompiledLearner
     if own is not None or config.engine == "torch":
         network, learner = TorchNetwork, TorchLearner
     # A small last layer starts near the uniform policy, or at means near 0.
@@ -135,17 +128,9 @@ def actor_critic(
     policy = Policy(actor, spaces.action_space, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
     critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
-    return ActorCritic(policy, critics, learner)
+    return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
 
 
 def ppo(config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
     """Policy and critics, and what trains them."""
-    policy, critics, learner = actor_critic(config, spaces, intrinsic, streams)
-    return PPO(
-        config.ppo,
-        policy,
-        critics,
-        learner(config.ppo, policy, critics),
-        RunningNormaliser(spaces.observation_size),
-        streams["minibatches"],
-    )
+    return PPO(actor_critic(config, spaces, intrinsic, streams), streams["minibatches"])

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from mace_rl.agent.policy import ActingPolicy, Policy
+from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation
 
@@ -42,6 +43,8 @@ class Learner(Protocol):
     """Changes the parameters of the policy and the critics, which share none, in place."""
 
     parameters: dict[str, np.ndarray]  # see `parameters_of`
+
+    def __init__(self, config: PPOConfig, policy: Policy, critics: Any) -> None: ...
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:

@@ -4,7 +4,6 @@ policy = load_agent("results/runs/CartPole-v1/ppo/seed0").policy
 action = policy(observation).sample()
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,16 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from mace_rl import files
-from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing, Policy
-from mace_rl.agent.ppo import first_normalisation
+from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
+from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.config.run import RunConfig
 from mace_rl.factories import actor_critic, environment
-from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
 from mace_rl.streams import Streams
-from mace_rl.trainer import Trainer
 
 
 class PolicyModule(TorchPolicy):
@@ -37,15 +34,11 @@ class PolicyModule(TorchPolicy):
     std: Tensor
     clip: Tensor
 
-    def __init__(
-        self,
-        policy: Policy,
-        space: Space[Any],
-        normalisation: tuple[np.ndarray, np.ndarray, float],
-    ) -> None:
-        super().__init__(policy)
+    def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
+        """space: that of what the environment gives."""
+        super().__init__(networks.policy)
         self.space = space
-        mean, std, clip = normalisation
+        mean, std, clip = networks.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
         self.register_buffer("clip", torch.from_numpy(np.array(clip)))
@@ -64,24 +57,11 @@ class PolicyModule(TorchPolicy):
 class Agent(torch.nn.Module):
     """The policy and the critics, whose inputs are observations normalised as the policy's."""
 
-    def __init__(
-        self,
-        policy: Policy,
-        critics: Mapping[str, Network],
-        space: Space[Any],
-        normalisation: tuple[np.ndarray, np.ndarray, float],
-    ) -> None:
+    def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
         super().__init__()
-        self.policy = PolicyModule(policy, space, normalisation)
-        self.critics = torch.nn.ModuleDict(
-            {kind: critic.module() for kind, critic in critics.items()}
-        )
-
-    @classmethod
-    def of(cls, trainer: Trainer) -> "Agent":
-        """As it is now."""
-        ppo, space = trainer.ppo, trainer.environment.given_space
-        return cls(ppo.policy, ppo.critics, space, ppo.normalisation())
+        self.policy = PolicyModule(networks, space)
+        critics = {kind: critic.module() for kind, critic in networks.critics.items()}
+        self.critics = torch.nn.ModuleDict(critics)
 
 
 @dataclass(frozen=True)
@@ -111,11 +91,8 @@ class Player:
     def __init__(self, config: RunConfig) -> None:
         streams = Streams(config.seed)
         self.environment = environment(config, streams)
-        made = actor_critic(config, self.environment, config.bonus is not None, streams)
-        self.policy, self.learner = made.policy, made.learner
-        normalisation = first_normalisation(config.ppo, self.environment.observation_size)
-        space = self.environment.given_space
-        self.agent = Agent(made.policy, made.critics, space, normalisation)
+        self.networks = actor_critic(config, self.environment, config.bonus is not None, streams)
+        self.agent = Agent(self.networks, self.environment.given_space)
 
     @classmethod
     def of(cls, run: FinishedRun) -> "Player":
@@ -134,19 +111,19 @@ class Player:
             if bad.any():
                 raise CheckpointError(f"{path}: {name} has NaN or Inf in it")
         self.agent.load_state_dict(state)
-        loaded = self.agent.policy
-        self.policy.network.load_module_state(loaded.network.state_dict())
-        if not self.policy.discrete:
-            self.policy.log_std[:] = loaded.log_std.detach().numpy()
+        policy, loaded = self.networks.policy, self.agent.policy
+        policy.network.load_module_state(loaded.network.state_dict())
+        if not policy.discrete:
+            policy.log_std[:] = loaded.log_std.detach().numpy()
 
     def acting(self, deterministic: bool) -> ActingPolicy:
         """Its policy for rollouts: it samples its actions, or takes the most probable ones."""
-        module = self.agent.policy
+        policy, module = self.networks.policy, self.agent.policy
         mean, std, clip = module.mean.numpy(), module.std.numpy(), float(module.clip)
         normalisation = Normalisation.of(mean, std, clip)
         if deterministic:
-            return MostProbable(self.policy, normalisation)
-        return self.learner.acting(self.policy, normalisation)
+            return MostProbable(policy, normalisation)
+        return self.networks.learner_of.acting(policy, normalisation)
 
 
 def _kind(entry: Any) -> str:

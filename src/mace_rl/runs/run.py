@@ -300,7 +300,7 @@ def write_results(
     """Write the records, the agent and, when those are safe, where they come from."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
-    agent = checkpoint.archive(Agent.of(trainer).state_dict())
+    agent = checkpoint.archive(Agent(trainer.ppo, trainer.environment.given_space).state_dict())
     write_atomically(directory / files.AGENT, agent)
     origin = identity | {
         "code": provenance.git_state(),
