@@ -2,21 +2,11 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 from shared import call
 
 from mace_rl.runs import verify
-
-RUN = "runs/CartPole-v1/ppo/seed0"
-
-
-@pytest.fixture
-def reference(trained, tmp_path) -> Path:
-    """A folder with one kept run."""
-    shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / RUN)
-    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -27,15 +17,18 @@ def reference(trained, tmp_path) -> Path:
         ("versions", {"numpy": "1.0"}, "versions.numpy was '1.0' and is"),
     ],
 )
-def test_verify_says_what_is_different(reference, monkeypatch, capsys, section, change, said):
-    path = reference / RUN / "run.json"
+def test_verify_says_what_is_different(
+    trained, tmp_path, monkeypatch, capsys, section, change, said
+):
+    run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "runs")
+    path = run / "run.json"
     record = json.loads(path.read_text(encoding="utf-8"))
     record["machine"]["cpu"] = "Z80"
     record["config"]["seed"] = int(section != "outputs")
     record[section].update(change)
     path.write_text(json.dumps(record), encoding="utf-8")
     expected = "mace-rl: not reproduced: 0 of 1 runs equal to the bit"
-    assert call(monkeypatch, "verify", str(reference)) == (1, expected)
+    assert call(monkeypatch, "verify", str(tmp_path)) == (1, expected)
     assert said in capsys.readouterr().out
 
 

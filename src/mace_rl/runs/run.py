@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,7 +87,8 @@ def run(
         if state is not None:
             resume(trainer, clock, state)
         checkpoint.require_plain(trainer.state_dict(), "state")  # not when it is late
-        observe = observe or partial(write_progress, directory)
+        told = directory / files.PROGRESS
+        observe = observe or (lambda progress: write_atomically(told, json.dumps(progress)))
 
         def save() -> None:
             with clock.saving():
@@ -110,7 +110,7 @@ def run(
         write_results(directory, trainer, identity, clock)
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
-        (directory / files.PROGRESS).unlink(missing_ok=True)
+        told.unlink(missing_ok=True)
 
 
 def to_continue(
@@ -287,11 +287,6 @@ def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
         "start_seconds": clock.start_seconds,
         "pid": os.getpid(),
     }
-
-
-def write_progress(directory: Path, progress: dict[str, Any]) -> None:
-    """Tell whoever watches the folder."""
-    write_atomically(directory / files.PROGRESS, json.dumps(progress))
 
 
 def write_results(
