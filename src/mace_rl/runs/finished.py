@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from mace_rl import files
-from mace_rl.config.plugins import config_of_run
+from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, check, short
 from mace_rl.results.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 from mace_rl.runs.provenance import difference, identity, read_record
 
@@ -49,7 +49,14 @@ class FinishedRun:
 
         Raises `ConfigError` if it cannot be used, or names code from outside without `trust`.
         """
-        return config_of_run(self.record["config"], str(self.folder / files.RECORD), self.trust)
+        origin, values = str(self.folder / files.RECORD), self.record["config"]
+        config = check(RunConfig, values, origin)
+        for key, text in ({} if self.trust else code_outside(values)).items():
+            raise ConfigError(
+                f"{origin}: {key} has {short(text)}, code from outside mace_rl: if you trust it, "
+                "give --trust (in a program: trust=True)"
+            )
+        return config
 
     def content(self, name: str) -> bytes:
         """One of `files.RESULTS`; `RecordError` if it is not the one that `run.json` describes."""
