@@ -1,5 +1,6 @@
 """A finished run's parts: what is damaged is refused in one line by every command that reads it."""
 
+import json
 import re
 import shutil
 
@@ -7,6 +8,9 @@ import pytest
 from shared import GOOD, call
 
 from mace_rl import files
+from mace_rl.results.records import RecordError
+from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.provenance import file_digest
 
 READ = {  # by the command
     "evaluate": [files.AGENT],
@@ -59,3 +63,16 @@ def test_a_run_json_that_is_none(refused, command):
         assert f"/run.json: {expected}" in refused(command, files.RECORD, content.encode())
     if command not in ("train", "tensorboard"):  # which are for unfinished runs, too
         assert "no finished run in" in refused(command, files.RECORD, None)
+
+
+@pytest.mark.parametrize("text", ["episode\nx\n", "", "\x00", '"'])
+def test_what_no_training_wrote_though_its_digest_is_right(trained, tmp_path, text):
+    run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "run")
+    record = json.loads((run / files.RECORD).read_text(encoding="utf-8"))
+    for name in (files.EPISODES, files.DIAGNOSTICS):
+        (run / name).write_text(text, encoding="utf-8")
+        record["outputs"][name] = file_digest(run / name)
+    (run / files.RECORD).write_text(json.dumps(record), encoding="utf-8")
+    for part, file in (("rows", "episodes"), ("episodes", "episodes"), ("diagnostics",) * 2):
+        with pytest.raises(RecordError, match=rf"/{file}\.csv: [^\n]*$"):
+            getattr(FinishedRun(run), part)

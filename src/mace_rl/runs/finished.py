@@ -18,6 +18,7 @@ from mace_rl.runs.provenance import difference, identity, read_record
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
 
+NEVER_WRITTEN = "not as a training writes it"
 WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
 
@@ -83,19 +84,25 @@ class FinishedRun:
 
     @cached_property
     def rows(self) -> list[EpisodeRecord]:
-        """The same without pandas; `RecordError` if it is not what `run.json` describes."""
-        types = get_type_hints(EpisodeRecord)
-        lines = csv.DictReader(io.StringIO(self.content(files.EPISODES).decode(), newline=""))
-        return [EpisodeRecord(**{name: types[name](row[name]) for name in types}) for row in lines]
+        """The same without pandas; `RecordError` names the file."""
+        types, content = get_type_hints(EpisodeRecord), self.content(files.EPISODES)
+        try:
+            lines = csv.DictReader(io.StringIO(content.decode(), newline=""))
+            return [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
+        except (KeyError, TypeError, ValueError, csv.Error):
+            raise RecordError(f"{self.folder / files.EPISODES}: {NEVER_WRITTEN}") from None
 
     @cached_property
     def diagnostics(self) -> "pd.DataFrame | None":
-        """`diagnostics.csv`, which a kept run may be without."""
+        """`diagnostics.csv`, numbers; a kept run may be without. `RecordError` names the file."""
         import pandas as pd
 
-        if not (self.folder / files.DIAGNOSTICS).exists():
-            return None
-        return pd.read_csv(io.BytesIO(self.content(files.DIAGNOSTICS)))
+        path = self.folder / files.DIAGNOSTICS
+        content = io.BytesIO(self.content(path.name)) if path.exists() else None
+        try:
+            return pd.read_csv(content, dtype=float).astype({"episode": int}) if content else None
+        except (KeyError, ValueError):
+            raise RecordError(f"{path}: {NEVER_WRITTEN}") from None
 
     @cached_property
     def agent_state(self) -> dict[str, Any]:

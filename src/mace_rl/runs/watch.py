@@ -112,7 +112,8 @@ def film(
     Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
     run = FinishedRun(directory, trust)
-    config, player = run.config, Player(run.config) if untrained else Player.of(run)
+    config = run.config
+    player = Player(config) if untrained else Player.of(run)
     environment, policy = player.environment, player.acting(deterministic)
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
