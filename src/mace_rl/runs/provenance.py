@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from mace_rl import sources
-from mace_rl.config.plugins import source_file
+from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.refusal import Refusal
@@ -60,7 +60,8 @@ class ProvenanceError(Refusal, ValueError):
 
 def identity(config: RunConfig) -> dict[str, Any]:
     """What two runs have in common that give the same results, and continue each other's."""
-    own = (source_file(reference, key) for key, reference in config.references().items())
+    named = config.references().items()
+    own = (file for key, name in named for file in source_files(name, key))
     return {
         "config": config.settings(),
         "versions": versions(),
