@@ -21,6 +21,7 @@ from mace_rl.runs.checkpoint import CheckpointError, archive
 from mace_rl.runs.provenance import file_digest
 
 PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
+NETWORK = {"kind": "torch", "module": "pydoc:pipepager"}
 OWN = {"kind": "custom", "estimator": "evil:Own"}
 HOSTILE = {  # by the key that is named
     "beta.rule": {"beta": PAGER},
@@ -67,14 +68,19 @@ def test_a_run_runs_only_this_package_s_code(kept, monkeypatch, tmp_path, key):
 
 
 def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkeypatch, tmp_path):
-    run = kept(beta=PAGER)
-    for words in (["evaluate", str(run)], ["watch", str(run)], ["verify", "."]):
-        code, said = call(monkeypatch, *words, "--trust")
-        assert code == 1 and "beta.rule has 'pydoc:pipepager', but it should name" in said
+    play = ["evaluate", "watch"]
+    for key, settings, commands in (
+        ("ppo.network.module", {"ppo": {"network": NETWORK}}, [*play, "verify"]),
+        ("beta.rule", {"beta": PAGER}, ["verify"]),  # which playing does not need
+    ):
+        run = kept(**settings)
+        for command in commands:
+            code, said = call(monkeypatch, command, str(run), "--trust")
+            assert code == 1 and f"{key} has 'pydoc:pipepager', but it should name" in said
     assert not (tmp_path / "ran").exists()
     folder = str(trained("CartPole-v1", "ppo", episodes=2, ppo={"network": LAYER_NORM}))
-    for words in (["evaluate", folder], ["watch", folder, "--out", "a.gif"]):
-        assert call(monkeypatch, *words, "--trust") == (0, "")
+    for command in play:
+        assert call(monkeypatch, command, folder, "--trust") == (0, "")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ import numpy as np
 from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.results.records import EpisodeRecord
-from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.finished import FinishedRun
 
 AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
 LONGEST = 60  # seconds of a run in a sample
@@ -140,18 +140,15 @@ def pack(results: Path, archives: Path) -> int:
         for run in variant.glob("seed*"):
             if not (run / files.RECORD).exists():
                 continue  # not finished
-            digests = read_record(run / files.RECORD)["outputs"]
+            whole = FinishedRun(run)
             before = packed.get(f"{run.name}/{files.RECORD}")
-            if before and json.loads(before)["outputs"] != digests:
+            if before and json.loads(before)["outputs"] != whole.record["outputs"]:
                 raise ValueError(f"{run}: {archive} has another run of this seed")
             kept = [files.EPISODES]
             if run.name == AT_PLAY and (run / files.AGENT).stat().st_size <= LARGEST:
                 kept.append(files.AGENT)
-            for name in kept:
-                if file_digest(run / name) != digests[name]:
-                    raise ValueError(f"{run / name}: not the file that run.json describes")
-            for name in (*kept, files.RECORD):
-                content[f"{run.name}/{name}"] = (run / name).read_bytes()
+            content |= {f"{run.name}/{name}": whole.content(name) for name in kept}
+            content[f"{run.name}/{files.RECORD}"] = (run / files.RECORD).read_bytes()
         if content != packed:  # compressing takes seconds
             write(archive, content)
         count += sum(name.endswith(files.RECORD) for name in content)

@@ -15,7 +15,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.config.study import folder_of
 from mace_rl.library import settings
 from mace_rl.refusal import Refusal
-from mace_rl.runs.finished import finished
+from mace_rl.runs.finished import FinishedRun, finished
 
 logger = logging.getLogger(__name__)
 
@@ -177,8 +177,7 @@ def status(arguments: argparse.Namespace) -> None:
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
     _require(arguments.seed >= 0, "--seed", arguments.seed, "be at least 0")
-    if not (arguments.folder / files.RECORD).exists():
-        raise ConfigError(f"no finished run in {arguments.folder}: it has no {files.RECORD}")
+    _ = FinishedRun(arguments.folder, arguments.trust).config  # before PyTorch, which takes seconds
 
 
 def evaluate(arguments: argparse.Namespace) -> None:

@@ -16,23 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check, short
-
-
-def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
-    """The configuration in a `run.json` or the like, which `origin` names.
-
-    Raises `ConfigError` if it cannot be used and, unless `trust`, if it names code from outside
-    this package; none of that has been imported then.
-    """
-    config = check(RunConfig, values, origin)
-    for key, text in ({} if trust else code_outside(values)).items():
-        raise ConfigError(
-            f"{origin}: {key} has {short(text)}, code from outside mace_rl: if you trust it, give "
-            "--trust (in a program: trust=True)"
-        )
-    return config
+from mace_rl.config.section import ConfigError, short
 
 
 def code_outside(settings: Any) -> dict[str, str]:

@@ -86,6 +86,9 @@ def as_rows(kind: type[Row], columns: Mapping[str, np.ndarray]) -> list[Row]:
 _BOUND = {int: 2**53, float: np.inf}  # of a number's size: an int is exact as a double
 
 
+ALTERED = "missing, cut off or altered (SHA-256 not as in run.json)"
+
+
 class RecordError(Refusal, ValueError):
     """A result file that cannot be trusted; the message names the file and the line."""
 
@@ -166,7 +169,7 @@ def read_table(
     except (ValueError, OverflowError, csv.Error):
         whole = False  # the first line that is wrong is named below
     if whole and digest and not known:
-        raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
+        raise RecordError(f"{path}: {ALTERED}")
     if whole:
         return frame
     for number, line in enumerate(lines[1:], start=2):

@@ -89,16 +89,3 @@ def read(path: Path) -> dict[str, Any]:
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
     return unarchive(data, path)
-
-
-def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
-    """The first key in which two nested dictionaries differ, with both values."""
-    for key in [*wanted, *(key for key in found if key not in wanted)]:
-        name = f"{prefix}{key}"
-        old, new = found.get(key), wanted.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            if old != new:
-                return difference(old, new, f"{name}.")
-        elif old != new:
-            return f"{name} was {short(old)} and is {short(new)}"
-    return "no difference"

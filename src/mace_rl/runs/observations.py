@@ -57,8 +57,8 @@ def _as_given(given: Any, space: Space[Any]) -> Tensor:
                 return one_hot.float()
         case MultiDiscrete(), _:
             each = zip(space.nvec.ravel(), space.start.ravel(), strict=True)
-            numbers = _numbers(given).flatten(-space.nvec.ndim).unbind(-1)
-            return _as_given(numbers, Tuple([Discrete(n, start=start) for n, start in each]))
+            parts = _numbers(given).flatten(-space.nvec.ndim).unbind(-1)
+            return _as_given(parts, Tuple([Discrete(n, start=start) for n, start in each]))
     raise ValueError
 
 
