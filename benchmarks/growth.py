@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 
 from benchmarks.measuring import FIRST_SEED, Scale, in_fresh_process, memory_mb
 from benchmarks.speed import our_config
-from mace_rl.results.paper import ACROBOT, HOPPER
+from mace_rl.study.paper import ACROBOT, HOPPER
 
 # Shaped like Acrobot and like Hopper, with their settings and time limits.
 WALKS = {"AcrobotLikeWalk-v0": ACROBOT, "HopperLikeWalk-v0": HOPPER}

@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from mace_rl.results.paper import ACROBOT, CARTPOLE, HOPPER
+from mace_rl.study.paper import ACROBOT, CARTPOLE, HOPPER
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = "measurements.csv"

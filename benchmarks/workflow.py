@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from benchmarks.measuring import ENVIRONMENTS, ROOT, Scale
-from mace_rl.results.paper import VARIANTS
+from mace_rl.study.paper import VARIANTS
 
 CORES = 2
 BEFORE, AFTER = "before the first training: imports, planning", "after the last: tables, figures"

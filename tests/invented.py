@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import check
-from mace_rl.results.aggregate import SCORED
-from mace_rl.results.metrics import Metric, metrics_columns
-from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
-from mace_rl.results.protocol import AREA, CORRELATION, QUESTIONS, ROBUST
+from mace_rl.study.claims_config import AREA, CORRELATION, QUESTIONS, ROBUST
+from mace_rl.study.compare.aggregate import SCORED
+from mace_rl.study.measure.metrics import Metric, metrics_columns
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import ENVIRONMENTS, VARIANTS
 
 SETTINGS = {
     "final_fraction": 0.1,

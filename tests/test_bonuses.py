@@ -17,10 +17,10 @@ from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.rnd import RandomNetworkDistillation
 from mace_rl.config.bonus import HashCountsBonus, ICMBonus, RNDBonus
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
+from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"

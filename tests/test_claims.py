@@ -9,10 +9,10 @@ import pytest
 import scipy.stats
 from invented import EPISODES, table_for_claims, table_for_questions
 
-from mace_rl.config.study import Study, read_study
-from mace_rl.results import claims
-from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, ROBUST, WAYS, asked
-from mace_rl.results.records import RecordError
+from mace_rl.runs.records import RecordError
+from mace_rl.study.claims_config import CLAIMS, CORRELATION, FAMILIES, LITERAL, ROBUST, WAYS, asked
+from mace_rl.study.compare import verdicts as claims
+from mace_rl.study.config import Study, read_study
 
 PAPERS = FAMILIES[:1]
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from shared import call
 
-from mace_rl.config.study import read_study
-from mace_rl.results.metrics import LearningCurve, all_metrics
-from mace_rl.results.records import read_episodes
 from mace_rl.runs.agent import load_agent
+from mace_rl.runs.records import read_episodes
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import LearningCurve, all_metrics
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")

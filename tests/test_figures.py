@@ -13,11 +13,11 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from mace_rl.config.results import FigureConfig
-from mace_rl.config.study import read_study
-from mace_rl.report.panels import MAX_POINTS, _thinned
-from mace_rl.results.figures import (
-    Look,
+from mace_rl.runs.records import RecordError
+from mace_rl.study.config import read_study
+from mace_rl.study.metrics_config import FigureConfig
+from mace_rl.study.show.curves import (
+    PlotStyle,
     draw_figure,
     figure_as_svg,
     mean_curves,
@@ -25,7 +25,7 @@ from mace_rl.results.figures import (
     save_figure,
     seed_curves,
 )
-from mace_rl.results.records import RecordError
+from mace_rl.study.show.svg import MAX_POINTS, _thinned
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
@@ -54,7 +54,7 @@ def data(shown=RETURN, runs=None, **shape):
 
 def draw(colours=COLOURS, shown=RETURN, runs=None, inset=None, **shape):
     layout = FigureConfig(columns=3, inset=inset)
-    look = Look(layout, 0.95, LABELS, colours)
+    look = PlotStyle(layout, 0.95, LABELS, colours)
     return draw_figure(*data(shown, runs, **shape), shown, look)
 
 
@@ -174,8 +174,12 @@ def test_importing_results_modules_is_quick():
     """Planning the workflow imports them; tables and figures do without torch altogether."""
     heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}
     slow = heavy | {"pandas", "matplotlib.figure", "seaborn", "scipy.stats"}
-    code = "import sys, mace_rl.results.{}; print(*(set({}) & set(sys.modules)))"
-    for module, forbidden in (("figures", slow), ("tables", heavy), ("comparisons", heavy)):
+    code = "import sys, mace_rl.study.{}; print(*(set({}) & set(sys.modules)))"
+    for module, forbidden in (
+        ("show.curves", slow),
+        ("show.tables", heavy),
+        ("compare.comparisons", heavy),
+    ):
         command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
         run = subprocess.run(command, capture_output=True, text=True, check=True)
         assert run.stdout.split() == []

@@ -18,7 +18,7 @@ import mace_rl
 from mace_rl import load_agent, settings, train
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
-from mace_rl.results.records import read_episodes
+from mace_rl.runs.records import read_episodes
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]

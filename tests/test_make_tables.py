@@ -9,11 +9,11 @@ import pytest
 import yaml
 from invented import digits_of, table_for_claims
 
-from mace_rl.config.study import read_study
-from mace_rl.results.claims import ledger
-from mace_rl.results.protocol import FAMILIES, ROBUST
-from mace_rl.results.renderings import number
 from mace_rl.runs.run import run
+from mace_rl.study.claims_config import FAMILIES, ROBUST
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import read_study
+from mace_rl.study.show.cells import number
 from tools import kept_runs, tables
 
 ROOT = Path(__file__).parents[1]

@@ -9,14 +9,14 @@ import pytest
 from invented import SEEDS, table_for_claims, table_for_questions, table_for_scores
 from matplotlib.figure import Figure
 
-from mace_rl.config.results import ConstantsConfig, FigureConfig, MetricsConfig
-from mace_rl.config.study import Study, read_study
-from mace_rl.report.panels import svg
-from mace_rl.results.claims import ledger
-from mace_rl.results.figures import Look, figure_as_svg, save_figure
-from mace_rl.results.pictures import PICTURES
-from mace_rl.results.protocol import FAMILIES, WAYS
-from mace_rl.results.statistics import mean_interval
+from mace_rl.study.claims_config import FAMILIES, WAYS
+from mace_rl.study.compare.statistics import mean_interval
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import Study, read_study
+from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
+from mace_rl.study.show.curves import PlotStyle, figure_as_svg, save_figure
+from mace_rl.study.show.pictures import PICTURES
+from mace_rl.study.show.svg import svg
 
 CONSTANTS = ["beta_1", "ppo"]
 ROOT = Path(__file__).parents[1]
@@ -60,7 +60,7 @@ def test_every_run_is_there_with_its_returns(runs, settings) -> None:
 def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings) -> None:
     table = PICTURES["constants"].data(runs, settings)
     names = sorted(set(table["variant"]))
-    look = Look(
+    look = PlotStyle(
         FigureConfig(columns=3), 0.95, {name: name for name in names}, dict.fromkeys(names, "C0")
     )
     panels = PICTURES["constants"].draw(table, look).axes
@@ -108,7 +108,7 @@ def test_every_picture_can_be_drawn_and_is_the_same_again(
     sources = {"forest": ledgers[0], "forest of questions": ledgers[1]}
     source, name = sources.get(name, runs), name.removesuffix(" of questions")
     names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}
-    look = Look(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"))
+    look = PlotStyle(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"))
     table = PICTURES[name].data(source, settings)
     table.to_csv(tmp_path / "table.csv", index=False)
     read = pd.read_csv(tmp_path / "table.csv", keep_default_na=False, na_values=[""])

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from mace_rl import files
-from mace_rl.config.study import read_study
-from mace_rl.results.claims import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
-from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, QUESTIONS, ROBUST
+from mace_rl.study.claims_config import CLAIMS, CORRELATION, FAMILIES, LITERAL, QUESTIONS, ROBUST
+from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
+from mace_rl.study.config import read_study
 from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]

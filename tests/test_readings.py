@@ -4,14 +4,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mace_rl.config.study import Study
-from mace_rl.results import readings as r
-from mace_rl.results import tables
-from mace_rl.results.figures import Look
-from mace_rl.results.metrics_table import metrics_table
-from mace_rl.results.paper import PAPER_TABLE1
-from mace_rl.results.renderings import markdown
-from mace_rl.results.statistics import logrank
+from mace_rl.study.compare import readings as r
+from mace_rl.study.compare.statistics import logrank
+from mace_rl.study.config import Study
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.paper import PAPER_TABLE1
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import markdown
+from mace_rl.study.show.curves import PlotStyle
 
 EPISODES = 400
 Frames = dict[tuple[str, str, int], pd.DataFrame]
@@ -119,6 +119,6 @@ def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> 
     table = r.readings(other, settings)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
-    look = Look(study.figure, 0.95, {name: name for name in colours}, colours)
+    look = PlotStyle(study.figure, 0.95, {name: name for name in colours}, colours)
     figure = r.draw_readings(table, settings, look)
     assert [axes.get_title() for axes in figure.axes] == ["Other-v0"]

@@ -17,19 +17,19 @@ import yaml
 from PIL import Image
 
 from mace_rl import files
-from mace_rl.config.results import ConstantsConfig
-from mace_rl.config.study import read_study
-from mace_rl.report.animations import animations
-from mace_rl.report.page import Making, _costs, duration, short
-from mace_rl.report.page import page as build
-from mace_rl.results.figures import Look
-from mace_rl.results.pages import read_data
-from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
-from mace_rl.results.protocol import WAYS
-from mace_rl.results.renderings import number
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
+from mace_rl.study.claims_config import WAYS
+from mace_rl.study.config import read_study
+from mace_rl.study.metrics_config import ConstantsConfig
+from mace_rl.study.paper import ENVIRONMENTS, VARIANTS
+from mace_rl.study.show.animations import animations
+from mace_rl.study.show.cells import number
+from mace_rl.study.show.curves import PlotStyle
+from mace_rl.study.show.markdown import read_data
+from mace_rl.study.show.report import Provenance, _costs, duration, short
+from mace_rl.study.show.report import page as build
 from tools.tables import RULES
 
 ROOT = Path(__file__).parents[1]
@@ -198,9 +198,9 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     data["figure2"] = data["figure2"].head(0)
     records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
-    making = Making("a command", {}, ppo, records)
+    making = Provenance("a command", {}, ppo, records)
     films = animations({("CartPole-v1", v): made / v for v in VARIANTS}, study.labels, made)
-    look = Look(study.figure, settings.confidence, study.labels, study.colours)
+    look = PlotStyle(study.figure, settings.confidence, study.labels, study.colours)
     how = making, films, settings, look
     html = build(data, claims, *how)
     assert html == build(data, claims, *how)

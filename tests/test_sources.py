@@ -12,8 +12,8 @@ PARTS = ("training", "everything")
 CHANGES = [  # of a file, and whether a training has other sources then
     ("agent/ppo.py", True),
     ("config/agent.py", True),
-    ("results/metrics.py", False),
-    ("results/records.py", True),
+    ("study/measure/metrics.py", False),
+    ("runs/records.py", True),
     ("report/page.py", False),
     ("a_new_file.py", True),
 ]

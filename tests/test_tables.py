@@ -17,18 +17,17 @@ from hypothesis import strategies as st
 from invented import digits_of, table_for_claims, table_for_tables
 
 from mace_rl.config.agent import PPOConfig, TorchModule
-from mace_rl.config.results import MetricsConfig
-from mace_rl.config.study import read_study
-from mace_rl.results import summary, tables
-from mace_rl.results.aggregate import aggregate
-from mace_rl.results.claims import ledger
-from mace_rl.results.comparisons import comparisons
-from mace_rl.results.latex import table1_latex, table2_latex
-from mace_rl.results.metrics import Metric, all_metrics, metrics_columns
-from mace_rl.results.pages import read_data, tables_page
-from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1, VARIANTS
-from mace_rl.results.protocol import FAMILIES, LITERAL, ROBUST
-from mace_rl.results.renderings import (
+from mace_rl.study.claims_config import FAMILIES, LITERAL, ROBUST
+from mace_rl.study.compare import summary
+from mace_rl.study.compare.aggregate import aggregate
+from mace_rl.study.compare.comparisons import comparisons
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_columns
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import ENVIRONMENTS, PAPER_TABLE1, VARIANTS
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import (
     Cell,
     Value,
     as_html,
@@ -38,6 +37,8 @@ from mace_rl.results.renderings import (
     markdown,
     number,
 )
+from mace_rl.study.show.latex import table1_latex, table2_latex
+from mace_rl.study.show.markdown import read_data, tables_page
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})

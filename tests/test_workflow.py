@@ -160,7 +160,7 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     (CONFIG, "seeds: [0]", "seeds: [0, 1]", TRAIN),
     (CONFIG, ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
     ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN | {"table2": 1}),
-    ("src/mace_rl/results/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
+    ("src/mace_rl/study/measure/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
     ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
     (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),

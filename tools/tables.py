@@ -35,10 +35,10 @@ import snakemake.script
 from threadpoolctl import threadpool_limits
 
 from mace_rl.config.reading import read_yaml
-from mace_rl.results.pages import Ledger
-from mace_rl.results.protocol import ROBUST
-from mace_rl.results.renderings import markdown
-from mace_rl.results.tables import parts
+from mace_rl.study.claims_config import ROBUST
+from mace_rl.study.show.cells import markdown
+from mace_rl.study.show.markdown import Ledger
+from mace_rl.study.show.tables import parts
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,8 +48,9 @@ CORES = len(os.sched_getaffinity(0))
 SHARED = (
     *("gymnasium", "smart_open", "nbformat", "pandas", "seaborn", "fontTools.subset"),
     *("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf"),
-    *("mace_rl.config.study", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
-    *(f"mace_rl.results.{name}" for name in ("comparisons", "pages", "pictures", "readings")),
+    *("mace_rl.study.config", "mace_rl.runs.provenance", "mace_rl.runs.queueing"),
+    *("mace_rl.study.compare.comparisons", "mace_rl.study.compare.readings"),
+    *("mace_rl.study.show.markdown", "mace_rl.study.show.pictures"),
 )
 fork = multiprocessing.get_context("fork")
 

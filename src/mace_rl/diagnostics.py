@@ -9,7 +9,7 @@ from mace_rl.agent.advantages import mean, variance
 from mace_rl.agent.ppo import Update
 from mace_rl.agent.products import dot
 from mace_rl.experience import Experience
-from mace_rl.results.records import UpdateRecord
+from mace_rl.runs.records import UpdateRecord
 
 
 def diagnose(

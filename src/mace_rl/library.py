@@ -14,9 +14,9 @@ from mace_rl import files
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import read_study
-from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.finished import finished, read_rows
+from mace_rl.runs.records import EpisodeRecord
+from mace_rl.study.config import read_study
 
 if TYPE_CHECKING:
     from mace_rl.runs.agent import Agent

@@ -37,7 +37,7 @@ from mace_rl.experience import (
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
 from mace_rl.finite import NonFiniteError, require_finite, require_share
-from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
+from mace_rl.runs.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
 
 

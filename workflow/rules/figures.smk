@@ -30,7 +30,7 @@ rule figure:
         "../scripts/figure.py"
 
 
-# Of all runs at once: `PICTURES` of mace_rl.results.pictures, the forest plot of the claims below.
+# Of all runs at once: `PICTURES` of mace_rl.study.show.pictures, the forest plot of the claims below.
 rule picture:
     input:
         f"{RESULTS}/metrics.csv",

@@ -37,7 +37,7 @@ rule page:
         configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
         ppo=ppo_settings(),
         own=own_code(),
-        template=provenance.file_digest(PACKAGE / "report" / "page.html"),
+        template=provenance.file_digest(PACKAGE / "study/show/report.html"),
         code=code("report.py", MEASURED),
     script:
         "../scripts/report.py"

@@ -12,11 +12,11 @@ from pathlib import Path
 from mace_rl import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import folder_of, load_study
+from mace_rl.study.config import folder_of, load_study
 from mace_rl.config.plugins import code_outside, source_file
 from mace_rl.environments import registered
-from mace_rl.results import paper, protocol
-from mace_rl.results.metrics import all_metrics
+from mace_rl.study import claims_config as protocol, paper
+from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
 

@@ -6,14 +6,14 @@ with job("claims", snakemake.log[0]):
     import json
     from pathlib import Path
 
-    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.claims import ledger
-    from mace_rl.results.metrics_table import BETAS, read_metrics
-    from mace_rl.results.pages import claims_page
-    from mace_rl.results.protocol import asked
-    from mace_rl.results.records import read_table
     from mace_rl.runs.provenance import read_record
+    from mace_rl.runs.records import read_table
+    from mace_rl.study.claims_config import asked
+    from mace_rl.study.compare.verdicts import ledger
+    from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+    from mace_rl.study.metrics_config import MetricsConfig
+    from mace_rl.study.show.markdown import claims_page
 
     params, found, output = snakemake.params, snakemake.input, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)

@@ -3,10 +3,10 @@
 from job import job
 
 with job("metrics", snakemake.log[0]):
-    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.metrics_table import betas_table, metrics_table
     from mace_rl.runs.finished import read_runs
+    from mace_rl.study.measure.run_metrics import betas_table, metrics_table
+    from mace_rl.study.metrics_config import MetricsConfig
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)

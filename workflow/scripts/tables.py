@@ -3,13 +3,13 @@
 from job import job
 
 with job("tables", snakemake.log[0]):
-    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results import summary
-    from mace_rl.results.aggregate import aggregate
-    from mace_rl.results.comparisons import comparisons
-    from mace_rl.results.latex import table1_latex
-    from mace_rl.results.metrics_table import read_metrics
+    from mace_rl.study.compare import summary
+    from mace_rl.study.compare.aggregate import aggregate
+    from mace_rl.study.compare.comparisons import comparisons
+    from mace_rl.study.measure.run_metrics import read_metrics
+    from mace_rl.study.metrics_config import MetricsConfig
+    from mace_rl.study.show.latex import table1_latex
 
     params, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(params.settings)

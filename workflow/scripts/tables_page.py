@@ -3,9 +3,9 @@
 from job import job
 
 with job("the page of tables", snakemake.log[0]):
-    from mace_rl.config.results import MetricsConfig
     from mace_rl.files import write_atomically
-    from mace_rl.results.pages import read_data, tables_page
+    from mace_rl.study.metrics_config import MetricsConfig
+    from mace_rl.study.show.markdown import read_data, tables_page
 
     params = snakemake.params
     settings = MetricsConfig.model_validate(params.settings)

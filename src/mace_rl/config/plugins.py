@@ -17,7 +17,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check, short
+from mace_rl.config.section import ConfigError, check, short_repr
 
 
 def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
@@ -29,7 +29,7 @@ def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
     config = check(RunConfig, values, origin)
     for key, text in ({} if trust else code_outside(values)).items():
         raise ConfigError(
-            f"{origin}: {key} has {short(text)}, code from outside mace_rl: if you trust it, give "
+            f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: if you trust it, give "
             "--trust (in a program: trust=True)"
         )
     return config

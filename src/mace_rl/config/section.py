@@ -55,7 +55,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case "extra_forbidden":
             nearest = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0)
             return (
-                f"unknown key {key!r} (value {short(problem['input'])}); "
+                f"unknown key {key!r} (value {short_repr(problem['input'])}); "
                 f"the nearest known key is {nearest[0]!r}"
             )
         case "missing":
@@ -63,10 +63,10 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case _:
             reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
             reason = " ".join(reason.replace(" after validation, not 0", "").split())
-            return f"{key} is {short(problem['input'])}, but {reason}{_advice(problem)}"
+            return f"{key} is {short_repr(problem['input'])}, but {reason}{_advice(problem)}"
 
 
-def short(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """`repr` of a value, cut to 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
@@ -84,7 +84,7 @@ def _advice(problem: ErrorDetails) -> str:
         number = float(text)
         if wanted == "float_type" or (wanted == "int_type" and number.is_integer()):
             quotes = ", without quotes" if isinstance(value, str) else ""
-            return f" (write {short(int(number) if number.is_integer() else number)}{quotes})"
+            return f" (write {short_repr(int(number) if number.is_integer() else number)}{quotes})"
     return ""
 
 

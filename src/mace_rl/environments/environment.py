@@ -1,4 +1,4 @@
-"""Making environments: Gymnasium's registry, generators that resume."""
+"""Provenance environments: Gymnasium's registry, generators that resume."""
 
 import copy
 import os

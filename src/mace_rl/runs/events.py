@@ -14,9 +14,9 @@ import pandas as pd
 from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
-from mace_rl.results.records import RecordError
 from mace_rl.runs import checkpoint
 from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.records import RecordError
 
 # Of a run's tables: the prefix of their tags, and what they are called in a checkpoint.
 TABLES = {files.EPISODES: ("episodes", "records"), files.DIAGNOSTICS: ("updates", "diagnostics")}

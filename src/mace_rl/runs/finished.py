@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, get_type_hints
 from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
-from mace_rl.results.records import EpisodeRecord, RunKey, read_episodes
 from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.records import EpisodeRecord, RunKey, read_episodes
 
 if TYPE_CHECKING:
     import pandas as pd

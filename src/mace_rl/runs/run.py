@@ -27,9 +27,9 @@ from mace_rl.config.run import RunConfig
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
-from mace_rl.results.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
+from mace_rl.runs.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.trainer import Trainer
 
 logger = logging.getLogger(__name__)

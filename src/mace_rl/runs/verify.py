@@ -13,9 +13,9 @@ import numpy as np
 from mace_rl import files
 from mace_rl.config.plugins import config_of_run
 from mace_rl.refusal import Refusal
-from mace_rl.results.records import RecordError, read_episodes
 from mace_rl.runs.checkpoint import difference
 from mace_rl.runs.provenance import read_record
+from mace_rl.runs.records import RecordError, read_episodes
 
 
 class NotReproducedError(Refusal):

@@ -16,26 +16,27 @@ import pandas as pd
 from matplotlib.colors import to_hex
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.results import FigureConfig, MetricsConfig
-from mace_rl.report.animations import Animation
-from mace_rl.report.panels import PAGE_COLOURS, panels, svg
-from mace_rl.results import pages, tables
-from mace_rl.results.claims import FEWEST_SEEDS, POWER
-from mace_rl.results.figures import Look, quantity, style
-from mace_rl.results.metrics import all_metrics
-from mace_rl.results.pages import Data, Ledger
-from mace_rl.results.pictures import PICTURES
-from mace_rl.results.readings import draw_readings
-from mace_rl.results.renderings import as_html, number
-from mace_rl.results.summary import from_to
+from mace_rl.study.compare.readings import draw_readings
+from mace_rl.study.compare.summary import from_to
+from mace_rl.study.compare.verdicts import FEWEST_SEEDS, POWER
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
+from mace_rl.study.show import markdown as pages
+from mace_rl.study.show import tables
+from mace_rl.study.show.animations import Animation
+from mace_rl.study.show.cells import as_html, number
+from mace_rl.study.show.curves import PlotStyle, quantity, style
+from mace_rl.study.show.markdown import Data, Ledger
+from mace_rl.study.show.pictures import PICTURES
+from mace_rl.study.show.svg import PAGE_COLOURS, panels, svg
 
-TEMPLATE = Path(__file__).with_name("page.html")
+TEMPLATE = Path(__file__).with_name("report.html")
 FIGURES = ("1", "2")
 MINUTE, HOUR = 60, 3600
 
 
 @dataclass(frozen=True)
-class Making:
+class Provenance:
     """How it was made."""
 
     command: str
@@ -47,10 +48,10 @@ class Making:
 def page(
     data: Data,
     claims: Ledger,
-    making: Making,
+    making: Provenance,
     animations: tuple[Mapping[str, Sequence[Animation]], Sequence[str]],
     settings: MetricsConfig,
-    look: Look,
+    look: PlotStyle,
 ) -> str:
     """The page as HTML; equal arguments give an equal page."""
     environment = jinja2.Environment(
@@ -104,7 +105,7 @@ def duration(seconds: float) -> str:
     return f"{number(seconds, 1)} s"
 
 
-def _panels(data: Data, figure: str, settings: MetricsConfig, look: Look) -> dict[str, str]:
+def _panels(data: Data, figure: str, settings: MetricsConfig, look: PlotStyle) -> dict[str, str]:
     """Figure 1 or 2, panel by panel."""
     curves, seeds = data[f"figure{figure}"], data[f"figure{figure}_seeds"]
     return panels(curves, seeds, quantity(figure, settings), look)
@@ -114,7 +115,7 @@ def _pictures(
     data: Data,
     claims: Ledger,
     settings: MetricsConfig,
-    look: Look,
+    look: PlotStyle,
 ) -> dict[str, str]:
     """Those that are wider than a phone, as SVG by name; those that this study has data for."""
     look = look._replace(layout=FigureConfig(columns=3))
@@ -132,7 +133,7 @@ def _pictures(
 
 
 def _tables(
-    data: Data, making: Making, settings: MetricsConfig, labels: Mapping[str, str]
+    data: Data, making: Provenance, settings: MetricsConfig, labels: Mapping[str, str]
 ) -> dict[str, Any]:
     """Every table, by its name in the template."""
     costs = _costs(making.records, data["metrics"], labels)

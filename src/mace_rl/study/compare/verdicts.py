@@ -13,17 +13,17 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.paper import FIXED, FULL, PAPER_METRICS, PAPER_TABLE1, PPO, VARIANTS
-from mace_rl.results.protocol import CORRELATION, Claim, Family, Part
-from mace_rl.results.records import RecordError
-from mace_rl.results.statistics import (
+from mace_rl.runs.records import RecordError
+from mace_rl.study.claims_config import CORRELATION, Claim, Family, Part
+from mace_rl.study.compare.statistics import (
     equivalence,
     holm,
     probability_of_improvement,
     stratified_comparison,
 )
+from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import FIXED, FULL, PAPER_METRICS, PAPER_TABLE1, PPO, VARIANTS
 
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import pandas as pd
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results import tables
-from mace_rl.results.renderings import escaped, latex_cell, latex_float
-from mace_rl.results.statistics import BOOTSTRAP_SEEDS, interval_kind
-from mace_rl.results.summary import from_to
+from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
+from mace_rl.study.compare.summary import from_to
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import escaped, latex_cell, latex_float
 
 INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
 

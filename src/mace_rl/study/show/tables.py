@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import all_metrics
-from mace_rl.results.paper import PAPER_METRICS
-from mace_rl.results.protocol import WAYS
-from mace_rl.results.readings import in_order, ranked, title
-from mace_rl.results.renderings import Cell, Value, estimate, number
-from mace_rl.results.statistics import interval
-from mace_rl.results.summary import digits_by_metric
+from mace_rl.study.claims_config import WAYS
+from mace_rl.study.compare.readings import in_order, ranked, title
+from mace_rl.study.compare.statistics import interval
+from mace_rl.study.compare.summary import digits_by_metric
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import PAPER_METRICS
+from mace_rl.study.show.cells import Cell, Value, estimate, number
 
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count

@@ -21,10 +21,10 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from mace_rl.config.plugins import import_module, load, source_file
 from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
-from mace_rl.config.results import GOALS, FigureConfig, MetricsConfig
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
-from mace_rl.config.section import ConfigError, Section, check, explain, short
+from mace_rl.config.section import ConfigError, Section, check, explain, short_repr
 from mace_rl.environments import registered
+from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig
 
 # Environments and variants name folders and appear in Snakemake's patterns. An environment may have
 # more, as in Gymnasium: package.module:Namespace/Id.
@@ -230,7 +230,7 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
         for key in IDENTITY:
             if key in layer:
                 raise ConfigError(
-                    f"{name}.{key} is {short(layer[key])}, but the lists environments, variants "
+                    f"{name}.{key} is {short_repr(layer[key])}, but the lists environments, variants "
                     "and seeds say which runs there are"
                 )
         settings = merge_layers(settings, layer)
@@ -267,7 +267,7 @@ def _check_name(environment: str, key: str) -> None:
     extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
     if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment) or len(environment) > 200:
         raise ConfigError(
-            f"{key} has {short(environment)}, but a name here becomes a folder: it should be up to "
+            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be up to "
             "200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
             "environment's may stand a module and ':', then a namespace and '/'"
         )

@@ -1,4 +1,4 @@
-"""metrics.csv: a row of `mace_rl.results.metrics` for each run, made from records or read back."""
+"""metrics.csv: a row of `mace_rl.study.measure.metrics` for each run, made from records or read back."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.results.metrics import (
-    Episode,
+from mace_rl.runs.records import RecordError, RunKey, read_table
+from mace_rl.study.measure.metrics import (
+    Attained,
     LearningCurve,
     Metric,
     all_metrics,
@@ -20,7 +20,7 @@ from mace_rl.results.metrics import (
     metrics_columns,
     stagnation_correlation,
 )
-from mace_rl.results.records import RecordError, RunKey, read_table
+from mace_rl.study.metrics_config import MetricsConfig
 
 BETAS = {"env": str, "variant": str, "seed": int}  # the columns of betas.csv
 BETAS |= dict.fromkeys(("beta_end", "beta_lowest", "beta_highest", "stagnation_correlation"), float)
@@ -42,12 +42,12 @@ def metrics_of_run(
     metrics = all_metrics(settings)
     for metric in metrics:
         value = metric.function(curve)
-        if metric.unit == "episodes" and isinstance(value, Episode):
+        if metric.unit == "episodes" and isinstance(value, Attained):
             row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
         elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
             row[metric.name] = float(value)
         else:
-            kind = "an Episode" if metric.unit == "episodes" else "a finite number"
+            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
             raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
     return {name: row[name] for name in metrics_columns(metrics)}
 

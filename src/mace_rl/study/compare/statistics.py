@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
 
-from mace_rl.config.results import MetricsConfig
+from mace_rl.study.metrics_config import MetricsConfig
 
 BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
 CHUNK = 2**20  # resampled values held in memory at a time

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.statistics import percentiles
+from mace_rl.study.compare.statistics import percentiles
+from mace_rl.study.metrics_config import MetricsConfig
 
 SCORED = ("final_return", "area_under_curve")
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import all_metrics
-from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.results.statistics import interval
+from mace_rl.study.compare.statistics import interval
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import PAPER_METRICS, PAPER_TABLE1
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mace_rl.results.paper import (
+from mace_rl.study.paper import (
     ACROBOT,
     CARTPOLE,
     ENVIRONMENTS,

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mace_rl.config.results import FigureConfig, MetricsConfig
-from mace_rl.results.metrics import moving_average
-from mace_rl.results.records import RecordError, RunKey
-from mace_rl.results.statistics import interval
+from mace_rl.runs.records import RecordError, RunKey
+from mace_rl.study.compare.statistics import interval
+from mace_rl.study.measure.metrics import moving_average
+from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 
 if TYPE_CHECKING:  # imported where they are used: planning the workflow does without
     import pandas as pd
@@ -46,7 +46,7 @@ class Quantity:
     zero_is_shown: bool = True  # whether a variant has a curve that is 0 throughout
 
 
-class Look(NamedTuple):
+class PlotStyle(NamedTuple):
     """What the configuration says of how pictures look."""
 
     layout: FigureConfig
@@ -125,7 +125,7 @@ def draw_figure(
     curves: "pd.DataFrame",
     single_seeds: "pd.DataFrame",
     shown: Quantity,
-    look: Look,
+    look: PlotStyle,
 ) -> "Figure":
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
@@ -268,7 +268,7 @@ def _is_early(curves: "pd.DataFrame", share: float) -> bool:
     return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
 
 
-def _draw(axes: "Axes", curves: "pd.DataFrame", look: Look) -> None:
+def _draw(axes: "Axes", curves: "pd.DataFrame", look: PlotStyle) -> None:
     """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
     drawn: list[np.ndarray] = []
     near = HIDDEN * np.ptp(curves["mean"])

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.statistics import (
+from mace_rl.study.compare.statistics import (
     holm,
     logrank,
     paired_comparison,
     probability_of_improvement,
 )
+from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
 
 ALL = "all"  # in the place of an environment: the mean over all of them
 UNTESTED = (np.nan, np.nan, np.nan, "", np.nan)  # difference to p_value of that

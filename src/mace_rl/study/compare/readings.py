@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
-from mace_rl.results.metrics import Metric, all_metrics
-from mace_rl.results.metrics_table import metrics_table
-from mace_rl.results.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.results.records import RunKey
-from mace_rl.results.statistics import logrank
-from mace_rl.results.summary import summary
+from mace_rl.runs.records import RunKey
+from mace_rl.study.compare.statistics import logrank
+from mace_rl.study.compare.summary import summary
+from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import PAPER_METRICS, PAPER_TABLE1
+from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -146,7 +146,7 @@ def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
     return ordered, bool(sure)
 
 
-def draw_readings(table: pd.DataFrame, settings: MetricsConfig, look: Look) -> "Figure":
+def draw_readings(table: pd.DataFrame, settings: MetricsConfig, look: PlotStyle) -> "Figure":
     """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
     environments, lines = list(table["env"].unique()), in_order(table)
     variants = list(table["variant"].unique())

@@ -8,15 +8,15 @@ from typing import Any
 
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results import tables
-from mace_rl.results.claims import POWER
-from mace_rl.results.comparisons import ALL
-from mace_rl.results.metrics_table import BETAS, read_metrics
-from mace_rl.results.protocol import FAMILIES, WAYS
-from mace_rl.results.records import read_table
-from mace_rl.results.renderings import markdown
-from mace_rl.results.summary import from_to
+from mace_rl.runs.records import read_table
+from mace_rl.study.claims_config import FAMILIES, WAYS
+from mace_rl.study.compare.comparisons import ALL
+from mace_rl.study.compare.summary import from_to
+from mace_rl.study.compare.verdicts import POWER
+from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import markdown
 
 TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
 RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}

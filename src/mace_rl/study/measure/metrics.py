@@ -2,7 +2,7 @@
 
 `METRICS` is the table of it, and columns, tables and comparisons follow it. A metric is a pure
 function of a `LearningCurve`; further ones, outside of this package, are added by the configuration
-(`metrics.custom`). An `Episode` metric that a run never attains is reported as E and flagged as
+(`metrics.custom`). An metric in episodes that a run never attains is reported as E and flagged as
 censored, never dropped; E is then a lower bound.
 """
 
@@ -17,8 +17,8 @@ import numpy as np
 import scipy  # loads what is used of it when it is
 
 from mace_rl.config.plugins import load
-from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import ConfigError
+from mace_rl.study.metrics_config import MetricsConfig
 
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
@@ -27,7 +27,7 @@ PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 
-class Episode(NamedTuple):
+class Attained(NamedTuple):
     """The episode (from 1) at which something is attained; E and censored if it never is."""
 
     number: int
@@ -68,11 +68,11 @@ class LearningCurve:
         """The return threshold of the way from random actions to `goal`."""
         return self.random_mean + self.settings.threshold * (goal - self.random_mean)
 
-    def first(self, reached: np.ndarray, episode: int = 1) -> Episode:
+    def first(self, reached: np.ndarray, episode: int = 1) -> Attained:
         """The first true entry of `reached` [n], whose entry 0 belongs to episode `episode`."""
         if not reached.any():
-            return Episode(len(self.returns), True)
-        return Episode(episode + int(np.argmax(reached)), False)
+            return Attained(len(self.returns), True)
+        return Attained(episode + int(np.argmax(reached)), False)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Metric:
     name: str  # of its column in metrics.csv
     label: str  # in tables
     unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
-    function: Callable[[LearningCurve], Episode | float]  # an Episode if the unit is episodes
+    function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
     needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
 
     @property
@@ -136,7 +136,7 @@ def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) 
     return float(scipy.stats.spearmanr(stagnation, following).statistic)
 
 
-def sample_efficiency(curve: LearningCurve) -> Episode:
+def sample_efficiency(curve: LearningCurve) -> Attained:
     """The first episode with a return ≥ threshold · final (paper, literally).
 
     A single lucky episode is enough. Where returns are negative the bar lies *above* the final
@@ -147,7 +147,7 @@ def sample_efficiency(curve: LearningCurve) -> Episode:
     return curve.first(reached & curve.learned)
 
 
-def convergence_steps(curve: LearningCurve) -> Episode:
+def convergence_steps(curve: LearningCurve) -> Attained:
     """The point where the slope of the moving average becomes minimal (paper).
 
     Our reading: the first episode, once the average has come threshold of the way from random to
@@ -164,7 +164,7 @@ def convergence_steps(curve: LearningCurve) -> Episode:
     return curve.first(learned & minimal & curve.learned, 2 * window)
 
 
-def convergence_steps_steepest(curve: LearningCurve) -> Episode:
+def convergence_steps_steepest(curve: LearningCurve) -> Attained:
     """The first episode after the steepest rise at which the slope is no longer positive.
 
     The steepest rise can be the recovery from a late collapse. Censored: the average never rises,
@@ -172,12 +172,12 @@ def convergence_steps_steepest(curve: LearningCurve) -> Episode:
     """
     window, slopes = curve.settings.moving_average, curve.slopes
     if not (slopes > 0).any():
-        return Episode(len(curve.returns), True)
+        return Attained(len(curve.returns), True)
     steepest = int(np.argmax(slopes))  # the first of equals
     return curve.first((slopes[steepest:] <= 0) & curve.learned, 2 * window + steepest)
 
 
-def convergence_steps_flattest(curve: LearningCurve) -> Episode:
+def convergence_steps_flattest(curve: LearningCurve) -> Attained:
     """The first episode at which the absolute slope is smallest in all of training.
 
     The most literal reading of the paper's sentence: it finds the flat start of a run that has yet
@@ -188,7 +188,7 @@ def convergence_steps_flattest(curve: LearningCurve) -> Episode:
     return curve.first(flattest & curve.learned, 2 * curve.settings.moving_average)
 
 
-def convergence_steps_public_code(curve: LearningCurve) -> Episode:
+def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     """The rule of the authors' public code, whatever the window configured here.
 
     The first 50-episode window past 30 % of training after which the moving average changes by less
@@ -200,7 +200,7 @@ def convergence_steps_public_code(curve: LearningCurve) -> Episode:
     return curve.first(flat, floor + 1)
 
 
-def sample_efficiency_common(curve: LearningCurve) -> Episode:
+def sample_efficiency_common(curve: LearningCurve) -> Attained:
     """The first episode whose moving average has come threshold of the way to the reference.
 
     The bar is random + threshold · (reference - random), the same for every variant: ending worse
@@ -209,17 +209,17 @@ def sample_efficiency_common(curve: LearningCurve) -> Episode:
     return _average_reaches(curve, curve.reference)
 
 
-def sample_efficiency_range(curve: LearningCurve) -> Episode:
+def sample_efficiency_range(curve: LearningCurve) -> Attained:
     """The first episode whose moving average has come threshold of the way from random to final.
 
     The bar is random + threshold · (final - random): it means the same for negative returns, and
     one lucky episode does not reach it. Censored: the run has not `learned`.
     """
     reached = _average_reaches(curve, curve.final)
-    return reached if curve.learned else Episode(len(curve.returns), True)
+    return reached if curve.learned else Attained(len(curve.returns), True)
 
 
-def convergence_steps_range(curve: LearningCurve) -> Episode:
+def convergence_steps_range(curve: LearningCurve) -> Attained:
     """The first episode from which on the moving average stays near the final return.
 
     Near is within band · (final - random). Censored: the average ends outside that band, or the
@@ -292,7 +292,9 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     for reference in settings.custom:
         metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
         if not isinstance(metric, Metric):
-            problem = f"is no mace_rl.results.metrics.Metric but of type {type(metric).__name__}"
+            problem = (
+                f"is no mace_rl.study.measure.metrics.Metric but of type {type(metric).__name__}"
+            )
         elif not metric.name.isidentifier():
             problem = f"has the name {metric.name!r}, but a column's name should be a word"
         elif {metric.name, metric.flag} & columns.keys():
@@ -315,7 +317,7 @@ def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
 
 
-def _average_reaches(curve: LearningCurve, goal: float) -> Episode:
+def _average_reaches(curve: LearningCurve, goal: float) -> Attained:
     """The first episode whose moving average is at the bar for `goal`."""
     return curve.first(curve.average >= curve.bar(goal), curve.settings.moving_average)
 

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from mace_rl.config.results import MetricsConfig
-from mace_rl.results.aggregate import SCORED
-from mace_rl.results.claims import CONFIDENCE, WORTH_MENTIONING
-from mace_rl.results.figures import LEGEND_HEIGHT, Look, grid, legend, style
-from mace_rl.results.metrics import METRICS
-from mace_rl.results.paper import FIXED, FULL, PPO
-from mace_rl.results.protocol import FROZEN, WAYS, WITHOUT_MEMORY
-from mace_rl.results.statistics import interval
-from mace_rl.results.tables import SOLVED
+from mace_rl.study.claims_config import FROZEN, WAYS, WITHOUT_MEMORY
+from mace_rl.study.compare.aggregate import SCORED
+from mace_rl.study.compare.statistics import interval
+from mace_rl.study.compare.verdicts import CONFIDENCE, WORTH_MENTIONING
+from mace_rl.study.measure.metrics import METRICS
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.paper import FIXED, FULL, PPO
+from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
+from mace_rl.study.show.tables import SOLVED
 
 if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ def every_seed(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return long.sort_index(kind="stable").reset_index(drop=True)  # run by run
 
 
-def draw_every_seed(table: pd.DataFrame, look: Look) -> "Figure":
+def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     """A dot per run, a dash at the mean of a variant; a row of panels per environment."""
     jitter = pd.Series(np.random.default_rng(0).uniform(-0.3, 0.3, len(table)), table.index)
     places = {name: place for place, name in enumerate(table["variant"].unique())}
@@ -85,7 +85,7 @@ def constants(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["env", "variant", "role", "mean", "low", "high", "seeds"])
 
 
-def draw_constants(table: pd.DataFrame, look: Look) -> "Figure":
+def draw_constants(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     """The constants joined by a line, the learned β across them, the others on the right."""
     with style():
         names = "Constant β", "Mean return of training"
@@ -129,7 +129,7 @@ def solved(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return counted["solved"].agg(solved="sum", seeds="size").reset_index()
 
 
-def draw_solved(table: pd.DataFrame, look: Look) -> "Figure":
+def draw_solved(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     """A cell per variant and environment: the darker, the more seeds solve it; in it how many."""
     import seaborn
 
@@ -192,7 +192,7 @@ def _what(part: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(words)
 
 
-def draw_forest(table: pd.DataFrame, look: Look) -> "Figure":
+def draw_forest(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     """A line per part, a panel per way of measuring; a claim's verdict stands at its right."""
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
@@ -270,7 +270,7 @@ class Picture(NamedTuple):
     """What makes the data of a picture, of metrics.csv's frame or the claims, and what draws it."""
 
     data: Callable[[Any, MetricsConfig], pd.DataFrame]
-    draw: Callable[[pd.DataFrame, Look], "Figure"]
+    draw: Callable[[pd.DataFrame, PlotStyle], "Figure"]
 
 
 PICTURES = {

@@ -6,8 +6,8 @@ import re
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mace_rl.config.results import FigureConfig
-from mace_rl.results.figures import Look, Quantity, draw_figure, figure_as_svg
+from mace_rl.study.metrics_config import FigureConfig
+from mace_rl.study.show.curves import PlotStyle, Quantity, draw_figure, figure_as_svg
 
 WIDTH, HEIGHT = 3.3, 2.5  # inches: letters of a readable size on a phone
 # What figures draw in black (seaborn: almost), light grey and white, in light and in dark.
@@ -20,7 +20,7 @@ def panels(
     curves: pd.DataFrame,
     single_seeds: pd.DataFrame,
     shown: Quantity,
-    look: Look,
+    look: PlotStyle,
 ) -> dict[str, str]:
     """The panel of each environment, as `draw_figure` draws it from the same data.
 
