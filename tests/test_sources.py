@@ -14,7 +14,7 @@ CHANGES = [  # of a file, and whether a training has other sources then
     ("config/agent.py", True),
     ("study/measure/metrics.py", False),
     ("runs/records.py", True),
-    ("report/page.py", False),
+    ("study/show/report.py", False),
     ("a_new_file.py", True),
 ]
 

@@ -29,8 +29,8 @@ def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
     config = check(RunConfig, values, origin)
     for key, text in ({} if trust else code_outside(values)).items():
         raise ConfigError(
-            f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: if you trust it, give "
-            "--trust (in a program: trust=True)"
+            f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: if you trust it, "
+            "give --trust (in a program: trust=True)"
         )
     return config
 

@@ -230,8 +230,8 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
         for key in IDENTITY:
             if key in layer:
                 raise ConfigError(
-                    f"{name}.{key} is {short_repr(layer[key])}, but the lists environments, variants "
-                    "and seeds say which runs there are"
+                    f"{name}.{key} is {short_repr(layer[key])}, but the lists environments, "
+                    "variants and seeds say which runs there are"
                 )
         settings = merge_layers(settings, layer)
     settings |= {"environment": environment, "variant": variant, "seed": 0}
@@ -267,8 +267,8 @@ def _check_name(environment: str, key: str) -> None:
     extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
     if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment) or len(environment) > 200:
         raise ConfigError(
-            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be up to "
-            "200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
+            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be up "
+            "to 200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
             "environment's may stand a module and ':', then a namespace and '/'"
         )
 

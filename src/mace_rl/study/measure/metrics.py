@@ -292,9 +292,7 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     for reference in settings.custom:
         metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
         if not isinstance(metric, Metric):
-            problem = (
-                f"is no mace_rl.study.measure.metrics.Metric but of type {type(metric).__name__}"
-            )
+            problem = f"is no {__name__}.Metric but of type {type(metric).__name__}"
         elif not metric.name.isidentifier():
             problem = f"has the name {metric.name!r}, but a column's name should be a word"
         elif {metric.name, metric.flag} & columns.keys():

@@ -1,4 +1,4 @@
-"""metrics.csv: a row of `mace_rl.study.measure.metrics` for each run, made from records or read back."""
+"""metrics.csv: a row of `metrics` for each run, made from records or read back; and betas.csv."""
 
 import math
 from collections.abc import Mapping, Sequence
