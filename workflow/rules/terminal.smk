@@ -77,10 +77,8 @@ onstart:
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments, study.variants):
         logger.info(line)
-    if ASKS and not CLAIMS:
-        logger.info(
-            "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
-        )
+    for title, lacking in {} if LEDGER else LACKING.items():
+        logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
     due = sum(run["due"] for run in planned["runs"])
     logger.info(
         f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}"

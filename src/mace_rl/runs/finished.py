@@ -1,35 +1,14 @@
 """Finished runs: whether a folder has one, and what it recorded."""
 
 import csv
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, get_type_hints
+from typing import get_type_hints
 
 from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.runs.provenance import file_digest, read_record
-from mace_rl.runs.records import EpisodeRecord, RunKey, read_episodes
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-def read_runs(
-    records: Iterable[str], runs: Iterable[tuple[str, str, int, int]]
-) -> dict[RunKey, "pd.DataFrame"]:
-    """The episodes of each run (`read_episodes`).
-
-    records: their `run.json`s, each beside its `episodes.csv`; runs: for each its environment,
-    variant, seed and number of episodes. Raises `RecordError` and `ProvenanceError` for what is
-    not what training wrote.
-    """
-    frames = {}
-    for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
-        digest = read_record(Path(record))["outputs"][files.EPISODES]
-        path = Path(record).with_name(files.EPISODES)
-        frames[environment, variant, seed] = read_episodes(path, episodes, digest)
-    return frames
+from mace_rl.runs.records import EpisodeRecord
 
 
 def read_rows(path: Path) -> list[EpisodeRecord]:

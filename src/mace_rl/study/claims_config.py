@@ -1,38 +1,26 @@
-"""What the study asks, as docs/protocol.md has it: the paper's claims, and questions of our own.
+"""What a paper says, and what is asked of one's own: the file that `claims` in config.yaml names.
 
-Each is made of parts, comparisons of two variants, which `claims` judges.
+Claims in families, each claim in parts that `compare.verdicts` judges; the paper's tables; and what
+all of it is called. `read_claims` checks the file against the study that names it.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+import math
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
-from mace_rl.study.paper import (
-    ACROBOT,
-    CARTPOLE,
-    ENVIRONMENTS,
-    FIXED,
-    FULL,
-    HOPPER,
-    PPO,
-    VARIANTS,
-)
+from pydantic import Field, model_validator
 
-CORRELATION = "stagnation_correlation"  # of betas.csv; over 0
-AREA = "area_under_curve"  # the mean return of training
+from mace_rl.config.agent import PPOConfig
+from mace_rl.config.reading import read_yaml
+from mace_rl.config.section import ConfigError, Section, check
+from mace_rl.environments import registered
+from mace_rl.study.config import Study, check_known
+from mace_rl.study.measure.metrics import CORRELATION, METRICS, all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
 
-WAYS = LITERAL, ROBUST = "by the paper's words and code", "robust"
-
-EXPLORATION = (  # tasks in which random actions hardly ever see a reward
-    "SparseMountainCar-v0",
-    "DeepSea10-v0",
-    "DeepSea20-v0",
-    "FrozenLake8x8Deterministic-v0",
-    "CliffWalking200-v0",
-)
-DISTRACTING = ("BarrenRegion-v0", "NoisyMountainCar-v0", "NoisyDeepSea10-v0")
-CONSTANTS = ("beta_0.1", "beta_0.4", "beta_1")
-FROZEN, WITHOUT_MEMORY = "mace_frozen", "mace_no_memory"
+Names = Annotated[list[str], Field(min_length=1)]
 
 
 class Part(NamedTuple):
@@ -42,160 +30,236 @@ class Part(NamedTuple):
     metric: str
     variant: str
     baseline: str | None  # None: over 0
+    in_paper: float  # variant - baseline in the paper's Table 1; NaN where that has none
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper's or a question of ours, and its parts, by how it is measured."""
-
-    name: str
-    statement: str
-    parts: Mapping[str, tuple[Part, ...]]
-    paper: tuple[str, int] | None = None  # the environment and column of the paper's Table 1
-
-
-@dataclass(frozen=True)
-class Family:
-    """Claims whose parts are corrected together, and what each kind of answer is called."""
+class ReportConfig(Section):
+    """The head of the report."""
 
     title: str
-    claims: tuple[Claim, ...]
-    words: Mapping[str, str]  # by how the parts came out: shown, reversed, absent, open
+    question: str
+    about: str
+    tasks: dict[str, str] = Field(default={})  # by environment, what an agent is to do there
 
 
-def _over_both(variant: str, metric: str, *environments: str) -> tuple[Part, ...]:
-    """`variant` over the two others of the paper's, in each environment."""
-    others = [name for name in VARIANTS if name != variant]
-    return tuple(Part((env,), metric, variant, other) for env in environments for other in others)
+class Table1Config(Section):
+    """The paper's Table 1."""
+
+    caption: str  # the names of its metrics
+    metrics: Names  # readings of one are the metrics whose names begin with its name
+    shuffled: list[str] = Field(default=[])  # readings that are asked of shuffled returns, too
+    variants: Annotated[dict[str, str], Field(min_length=1)]  # and what the ledger calls them
+    # By environment and variant a number for each metric.
+    values: dict[str, dict[str, list[int | float]]]
+
+    def value(self, environment: str, variant: str, metric: str) -> float | None:
+        """What the paper has there; None where it has nothing."""
+        numbers = self.values.get(environment, {}).get(variant)
+        return numbers[self.metrics.index(metric)] if numbers and metric in self.metrics else None
+
+    def is_within(self, environments: Iterable[str], variants: Iterable[str]) -> bool:
+        """Whether a study of these has all that the table has."""
+        return set(self.values) <= set(environments) and set(self.variants) <= set(variants)
 
 
-def _speed(name: str, environment: str, statement: str, column: int) -> Claim:
-    """A claim that full is the first in a column of the paper's Table 1."""
-    names = [
-        ("sample_efficiency", "sample_efficiency_common"),
-        ("convergence_steps_public_code", "convergence_steps"),
-    ][column]
-    literal, robust = (_over_both(FULL, metric, environment) for metric in names)
-    return Claim(name, statement, {LITERAL: literal, ROBUST: robust}, (environment, column))
+class PlaceConfig(Section):
+    """A column of the paper's Table 1."""
+
+    environment: str
+    metric: str
 
 
-def _same(parts: tuple[Part, ...]) -> dict[str, tuple[Part, ...]]:
-    return {LITERAL: parts, ROBUST: parts}
+class PartsConfig(Section):
+    """Parts of a claim that differ in environment and in what `variant` is better than."""
+
+    environments: Names  # a part for each ...
+    together: bool = False  # ... or, if true, one over all of them
+    metric: str
+    variant: str
+    over: list[str]  # a part for each; empty: over 0
+
+    @model_validator(mode="after")
+    def _over_others(self) -> "PartsConfig":
+        if self.variant in self.over:
+            raise ValueError(f"over has the variant itself, {self.variant!r}")
+        return self
+
+    def each(self, place: PlaceConfig | None, table1: Table1Config) -> list[Part]:
+        """The parts: environment by environment, in each the variants that it is over.
+
+        place: in the paper's Table 1, where that says the same.
+        """
+        groups = [self.environments] if self.together else [[env] for env in self.environments]
+        others: list[str | None] = [*self.over] or [None]
+        return [self._part(group, other, place, table1) for group in groups for other in others]
+
+    def _part(
+        self, group: list[str], other: str | None, place: PlaceConfig | None, table1: Table1Config
+    ) -> Part:
+        in_paper = math.nan
+        if (
+            place
+            and other
+            and group == [place.environment]
+            and self.metric.startswith(place.metric)
+        ):
+            both = self.variant, other
+            mine, theirs = (table1.value(place.environment, name, place.metric) for name in both)
+            in_paper = math.nan if mine is None or theirs is None else float(mine - theirs)
+        return Part(tuple(group), self.metric, self.variant, other, in_paper)
 
 
-def _pays(name: str, environment: str) -> Claim:
-    """The question whether learning β pays in a task in which the bonus distracts."""
-    task = environment.removesuffix("-v0")
-    others = (PPO, *CONSTANTS, FROZEN)
-    parts = tuple(Part((environment,), AREA, FULL, other) for other in others)
-    statement = f"{task}: the learned β beats PPO, every constant and the frozen LSTM"
-    return Claim(name, statement, {ROBUST: parts})
+class ClaimConfig(Section):
+    """A claim or a question, and its parts, by one or several of `ways`."""
 
-
-CLAIMS = (
-    _speed("C1", ACROBOT, "Acrobot: the learned β has the best sample efficiency", 0),
-    _speed("C2", ACROBOT, "Acrobot: the learned β converges first", 1),
-    _speed("C3", HOPPER, "Hopper: the learned β has the best sample efficiency", 0),
-    _speed("C4", HOPPER, "Hopper: the learned β converges first", 1),
-    _speed("C5", CARTPOLE, "CartPole: the learned β has the best sample efficiency", 0),
-    Claim(
-        "C6",
-        "CartPole: the fixed β converges first and ends slightly above the learned one",
-        {
-            how: (
-                *_over_both(FIXED, metric, CARTPOLE),
-                Part((CARTPOLE,), "final_return", FIXED, FULL),
-            )
-            for how, metric in (
-                (LITERAL, "convergence_steps_public_code"),
-                (ROBUST, "convergence_steps"),
-            )
-        },
-        (CARTPOLE, 1),
-    ),
-    Claim(
-        "C7",
-        "Acrobot and Hopper: the learned β ends above both others",
-        _same(_over_both(FULL, "final_return", ACROBOT, HOPPER)),
-    ),
-    Claim(
-        "C8",
-        "Over all environments the learned β outperforms both others",
-        {
-            how: tuple(Part(ENVIRONMENTS, metric, FULL, other) for other in (PPO, FIXED))
-            for how, metric in ((LITERAL, "sample_efficiency"), (ROBUST, AREA))
-        },
-    ),
-    Claim(
-        "C9",
-        "β rises when progress stalls and falls when learning advances",
-        _same(tuple(Part((env,), CORRELATION, FULL, None) for env in ENVIRONMENTS)),
-    ),
-    Claim(
-        "C10",
-        "CartPole: the learned β has the steepest initial curve",
-        _same(_over_both(FULL, "early_return", CARTPOLE)),
-    ),
-)
-ELSEWHERE = (ACROBOT, CARTPOLE, *EXPLORATION)
-QUESTIONS = (
-    Claim(
-        "Q1",
-        "Where exploration is needed, a bonus helps: β = 0.4 beats PPO in each of five tasks",
-        {ROBUST: tuple(Part((env,), AREA, "beta_0.4", PPO) for env in EXPLORATION)},
-    ),
-    Claim(
-        "Q2",
-        "In three tasks made for it the bonus distracts: β = 0.1 beats β = 1 in each",
-        {ROBUST: tuple(Part((env,), AREA, "beta_0.1", "beta_1") for env in DISTRACTING)},
-    ),
-    *(_pays(f"Q{number}", env) for number, env in enumerate(DISTRACTING, 3)),
-    Claim(
-        "Q6",
-        "Elsewhere, over seven environments: the learned β beats each constant and the frozen LSTM",
-        {ROBUST: tuple(Part(ELSEWHERE, AREA, FULL, other) for other in (*CONSTANTS, FROZEN))},
-    ),
-    Claim(
-        "Q7",
-        "Over the three tasks that distract, memory helps the learned β",
-        {ROBUST: (Part(DISTRACTING, AREA, FULL, WITHOUT_MEMORY),)},
-    ),
-    Claim(
-        "Q8",
-        "Elsewhere, over seven environments: memory helps the learned β",
-        {ROBUST: (Part(ELSEWHERE, AREA, FULL, WITHOUT_MEMORY),)},
-    ),
-)
-FAMILIES = (
-    Family(
-        "the paper's claims",
-        CLAIMS,
-        {
-            "shown": "reproduced",
-            "reversed": "reversed",
-            "absent": "not reproduced",
-            "open": "open",
-        },
-    ),
-    Family(
-        "our own questions",
-        QUESTIONS,
-        {"shown": "yes", "reversed": "the opposite", "absent": "no", "open": "open"},
-    ),
-)
-
-
-def asked(environments: Iterable[str], variants: Iterable[str]) -> list[Family]:
-    """What a study of these can answer: the families all of whose parts it has."""
-    has = set(environments), set(variants)
-    return [
-        family
-        for family in FAMILIES
-        if all(
-            has[0].issuperset(part.environments)
-            and has[1].issuperset({part.variant, part.baseline or part.variant})
-            for claim in family.claims
-            for parts in claim.parts.values()
-            for part in parts
-        )
+    statement: str
+    table1: PlaceConfig | None = None  # where the paper's Table 1 says so
+    parts: Annotated[
+        dict[str, Annotated[list[PartsConfig], Field(min_length=1)]], Field(min_length=1)
     ]
+
+
+class WordsConfig(Section):
+    """What each kind of answer is called."""
+
+    shown: str
+    reversed: str
+    absent: str
+    open: str
+
+
+class FamilyConfig(Section):
+    """Claims whose parts are corrected together; all are measured in the same ways."""
+
+    words: WordsConfig
+    claims: Annotated[dict[str, ClaimConfig], Field(min_length=1)]
+
+    @property
+    def ways(self) -> list[str]:
+        """In which ways its claims are measured."""
+        return list(next(iter(self.claims.values())).parts)
+
+
+class ClaimsConfig(Section):
+    """The whole file."""
+
+    report: ReportConfig
+    variants: dict[str, str] = Field(default={})  # what they are called in few words
+    table1: Table1Config
+    table2: dict[str, str] = Field(default={})  # settings of `ppo`, and what the paper calls them
+    ways: dict[str, str]  # to measure a claim, each with what the report says of it
+    families: dict[str, FamilyConfig] = Field(default={})
+
+    def lacking(
+        self, environments: Iterable[str], variants: Iterable[str], settings: MetricsConfig
+    ) -> dict[str, list[str]]:
+        """By family, what a study of these lacks for the family's parts: nothing, if it is asked.
+
+        Parts of returns have their margin by `metrics.reference_return` of their environments.
+        """
+        has = {*environments, *variants, *(one.name for one in all_metrics(settings)), CORRELATION}
+        found = {}
+        for title, family in self.families.items():
+            parts = [part for _, part in parts_of(family)]
+            needed = [[*one.environments, one.variant, *one.over, one.metric] for one in parts]
+            goals = [env for one in parts for env in one.environments]
+            names = [name for name in chain.from_iterable(needed) if name not in has]
+            names += [
+                f"metrics.reference_return.{env}"
+                for env in goals
+                if env in has and env not in settings.reference_return
+            ]
+            found[title] = list(dict.fromkeys(names))
+        return found
+
+
+def parts_of(family: FamilyConfig) -> list[tuple[str, PartsConfig]]:
+    """All of a family's parts, each with the key of its claim and way."""
+    return [
+        (f"{name}.parts.{way}", part)
+        for name, claim in family.claims.items()
+        for way, parts in claim.parts.items()
+        for part in parts
+    ]
+
+
+def parse_claims(path: str | Path) -> ClaimsConfig:
+    """The file at `path`, whatever study it is for; a `ConfigError` with its first mistake."""
+    return check(ClaimsConfig, read_yaml(Path(path)), str(path))
+
+
+def read_claims(study: Study, path: str | Path) -> ClaimsConfig:
+    """The file that a study names, checked against it; a `ConfigError` with its first mistake."""
+    claims = parse_claims(path)
+    try:
+        _check_names(claims, study)
+        _check_form(claims)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return claims
+
+
+def _check_names(claims: ClaimsConfig, study: Study) -> None:
+    """Refuse a metric, variant, environment, way or setting that there is not."""
+    measured = all_metrics(study.metrics.within(study.environments, study.variants))
+    metrics = [metric.name for metric in (*METRICS, *measured)]
+    own = {*study.environments, *study.environment_settings}
+    known: dict[str, tuple[Iterable[str], str]] = {
+        "metric": ([*metrics, CORRELATION], "the metrics"),
+        "measured": ([metric.name for metric in measured], "what this study measures"),
+        "variant": ([*claims.variants, *study.variant_settings], "variants and variant_settings"),
+        "environment": ([*registered(), *own], "Gymnasium's registry"),
+        "way": (claims.ways, "ways"),
+        "setting": (PPOConfig.model_fields, "the settings of ppo"),
+    }
+    for key, kind, names in _names(claims):
+        for name in names:
+            if not (kind == "environment" and ":" in name):  # of another study's own
+                check_known(name, known[kind][0], key, known[kind][1])
+
+
+def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
+    """What the file names: key, kind and names."""
+    table1 = claims.table1
+    yield "table1.metrics", "measured", table1.metrics
+    yield "table1.shuffled", "measured", table1.shuffled
+    yield "table1.variants", "variant", table1.variants
+    yield "table1.values", "environment", table1.values
+    yield "table2", "setting", claims.table2
+    yield "report.tasks", "environment", claims.report.tasks
+    for title, family in claims.families.items():
+        for name, claim in family.claims.items():
+            yield f"families.{title}.claims.{name}.parts", "way", claim.parts
+        for key, part in parts_of(family):
+            key = f"families.{title}.claims.{key}"
+            yield f"{key}.environments", "environment", part.environments
+            yield f"{key}.metric", "metric", [part.metric]
+            yield f"{key}.variant", "variant", [part.variant]
+            yield f"{key}.over", "variant", part.over
+
+
+def _check_form(claims: ClaimsConfig) -> None:
+    """Refuse a Table 1 with holes, and claims that cannot be told apart or judged together."""
+    table1, seen = claims.table1, set()
+    for environment, rows in table1.values.items():
+        for variant in {*rows, *table1.variants}:
+            numbers = rows.get(variant, [])
+            if variant not in table1.variants or len(numbers) != len(table1.metrics):
+                raise ConfigError(
+                    f"table1.values.{environment}.{variant} is {numbers}, but each of"
+                    f" table1.variants, and no other, should have {len(table1.metrics)} numbers"
+                )
+    for title, family in claims.families.items():
+        for name, claim in family.claims.items():
+            key, place = f"families.{title}.claims.{name}", claim.table1
+            if name in seen:
+                raise ConfigError(f"{key} is there twice, but each claim should have its own name")
+            seen.add(name)
+            if list(claim.parts) != family.ways:
+                raise ConfigError(
+                    f"{key}.parts has {list(claim.parts)}, but should have {family.ways} as the"
+                    " first of its family"
+                )
+            if place:
+                check_known(place.environment, table1.values, f"{key}.table1", "table1.values")
+                check_known(place.metric, table1.metrics, f"{key}.table1", "table1.metrics")

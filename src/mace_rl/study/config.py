@@ -96,6 +96,7 @@ class Study(Section):
     variant_settings: dict[str, Variant]  # ... and for a variant
     metrics: MetricsConfig
     figure: FigureConfig
+    claims: str  # the file of what the paper says: study/claims_config.py
 
     @cached_property
     def _resolved(self) -> dict[tuple[str, str], RunConfig]:
@@ -138,7 +139,7 @@ class Study(Section):
         """
         found = None if changes else self._resolved.get((environment, variant))
         if found is None:
-            _check_known(variant, self.variant_settings, "variant", "variant_settings")
+            check_known(variant, self.variant_settings, "variant", "variant_settings")
             found = _resolve(self, environment, variant, changes or {})
             if not changes:
                 self._resolved[environment, variant] = found
@@ -158,7 +159,7 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     study = check(Study, {str(key): value for key, value in config.items()}, origin)
     try:
         for variant in study.variants:
-            _check_known(variant, study.variant_settings, "variants", "variant_settings")
+            check_known(variant, study.variant_settings, "variants", "variant_settings")
         for variant in study.variant_settings:
             _check_name(variant, "variant_settings")
         for variant, shown in study.variant_settings.items():
@@ -174,22 +175,20 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
             )
         for pair in study.metrics.comparisons:
             for variant in pair:
-                _check_known(
+                check_known(
                     variant, study.variant_settings, "metrics.comparisons", "variant_settings"
                 )
         known = dict.fromkeys([*study.environments, *study.environment_settings])
         for environment, variant in itertools.product(known, study.variant_settings):
             study.run_config(environment, variant, 0)  # checks its settings
         for environment in study.environment_seeds:
-            _check_known(environment, known, "environment_seeds", "environments")
+            check_known(environment, known, "environment_seeds", "environments")
         for environment in study.environments:
             study.metrics.random_return_in(environment)  # there has to be one
         for key in ("random_return", *GOALS):
             for environment in getattr(study.metrics, key):
                 if environment not in known and ":" not in environment:
-                    _check_known(
-                        environment, registered(), f"metrics.{key}", "Gymnasium's registry"
-                    )
+                    check_known(environment, registered(), f"metrics.{key}", "Gymnasium's registry")
         for reference in study.metrics.custom:
             load(reference, "metrics.custom")
     except ConfigError as error:
@@ -267,9 +266,9 @@ def _check_name(environment: str, key: str) -> None:
     extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
     if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment) or len(environment) > 200:
         raise ConfigError(
-            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be up "
-            "to 200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before an "
-            "environment's may stand a module and ':', then a namespace and '/'"
+            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be "
+            "up to 200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before "
+            "an environment's may stand a module and ':', then a namespace and '/'"
         )
 
 
@@ -286,7 +285,7 @@ def _check_environment(config: RunConfig) -> None:
                 "mace-rl's extra [study] has it"
             )
         hint = "" if ":" in name else f" (if a module registers it: module:{name})"
-        _check_known(own, registered(), key, f"Gymnasium's registry{hint}")
+        check_known(own, registered(), key, f"Gymnasium's registry{hint}")
     spec = registered()[own]
     if (config.max_episode_steps or spec.max_episode_steps) is None:
         raise ConfigError(
@@ -304,7 +303,8 @@ def _check_environment(config: RunConfig) -> None:
             ) from None
 
 
-def _check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
+def check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
+    """Refuse a name that is not among those `known`, which stand `where`."""
     known = list(known)
     if name not in known:
         nearest = difflib.get_close_matches(name, known, n=1)

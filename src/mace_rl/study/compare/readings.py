@@ -6,36 +6,35 @@ there is first by chance and by how returns are distributed, since nothing is le
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from mace_rl.runs.records import RunKey
+from mace_rl.study.claims_config import Table1Config
 from mace_rl.study.compare.statistics import logrank
 from mace_rl.study.compare.summary import summary
 from mace_rl.study.measure.metrics import Metric, all_metrics
 from mace_rl.study.measure.run_metrics import metrics_table
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.paper import PAPER_METRICS, PAPER_TABLE1
-from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"
-# The paper's words, and the rule of its public code: what is worth asking of noise too.
-ASKED_OF_NOISE = ("sample_efficiency", "convergence_steps_public_code")
 COLUMNS = ["env", "kind", "reading", "source", "variant", "mean", "low", "high", "seeds"]
 COLUMNS += ["censored", "rank", "p_value"]  # of readings.csv
 LEVEL = 0.05  # of the log-rank test that the first is really ahead
 
 
-def kinds(settings: MetricsConfig) -> list[tuple[str, Metric]]:
-    """Every reading with the one of the paper's metrics that it reads, in the order of tables."""
+def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metric]]:
+    """Every reading with the one of the paper's metrics that it reads, in the order of tables.
+
+    Only what counts episodes can be read in several ways.
+    """
     found = [metric for metric in all_metrics(settings) if metric.unit == "episodes"]
     return [
-        (kind, metric) for kind in PAPER_METRICS for metric in found if metric.name.startswith(kind)
+        (kind, metric)
+        for kind in table1.metrics
+        for metric in found
+        if metric.name.startswith(kind)
     ]
 
 
@@ -50,7 +49,9 @@ def shuffled(
     }
 
 
-def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
+def readings(
+    frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig, table1: Table1Config
+) -> pd.DataFrame:
     """The data of readings.csv: one row per environment, reading, source and variant.
 
     frames: the records (`read_episodes`) of each run (environment, variant, seed). Columns: env,
@@ -58,15 +59,16 @@ def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> 
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
     """
-    found = kinds(settings)
+    found = kinds(settings, table1)
     runs = {RUNS: metrics_table(frames, settings)}
     runs[SHUFFLED] = metrics_table(shuffled(frames, settings), settings)
-    means = {source: summary(table, settings) for source, table in runs.items()}
+    means = {source: summary(table, settings, table1) for source, table in runs.items()}
     parts = []
     for environment in dict.fromkeys(name for name, _, _ in frames):
-        parts += [_published(environment, kind, list(frames)) for kind in PAPER_METRICS]
+        for kind in dict.fromkeys(kind for kind, _ in found):
+            parts.append(_published(environment, kind, list(frames), table1))
         for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
-            if source == RUNS or metric.name in ASKED_OF_NOISE:
+            if source == RUNS or metric.name in table1.shuffled:
                 table, own = means[source], runs[source]
                 rows = table[(table["env"] == environment) & (table["metric"] == metric.name)]
                 own = own[own["env"] == environment]
@@ -77,12 +79,15 @@ def readings(frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> 
     return table[COLUMNS].reset_index(drop=True)
 
 
-def _published(environment: str, kind: str, runs: Sequence[RunKey]) -> pd.DataFrame:
+def _published(
+    environment: str, kind: str, runs: Sequence[RunKey], table1: Table1Config
+) -> pd.DataFrame:
     """The numbers of the paper's Table 1, of the variants that are there."""
+    variants = dict.fromkeys(variant for _, variant, _ in runs)
     values = {
-        name: float(PAPER_TABLE1[environment, name][PAPER_METRICS.index(kind)])
-        for name in dict.fromkeys(variant for _, variant, _ in runs)
-        if (environment, name) in PAPER_TABLE1
+        name: float(value)
+        for name in variants
+        if (value := table1.value(environment, name, kind)) is not None
     }
     rows = pd.DataFrame({"variant": list(values), "mean": list(values.values())})
     rows = rows.assign(env=environment, kind=kind, metric=kind, source=PAPER, low=np.nan)
@@ -114,9 +119,8 @@ def _measured(
     return rows.assign(rank=rows["mean"].rank(method="min").astype(int), p_value=p_values)
 
 
-def title(kind: str, reading: str, source: str, settings: MetricsConfig) -> str:
-    """A reading as a row of the table or the figure is called."""
-    names = {metric.name: metric.label for _, metric in kinds(settings)}
+def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str:
+    """A reading as a row of the table or the figure is called; `names` are the metrics' labels."""
     if source == PAPER:
         return f"{names[kind]}: the paper's Table 1"
     if source == SHUFFLED:
@@ -134,8 +138,8 @@ def in_order(
             ["kind", "reading", "source"], sort=False
         )
     ]
-    sources = PAPER, RUNS, SHUFFLED
-    return sorted(found, key=lambda one: (PAPER_METRICS.index(one[0][0]), sources.index(one[0][2])))
+    order = list(table["kind"].unique()), [PAPER, RUNS, SHUFFLED]
+    return sorted(found, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
 
 
 def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
@@ -144,45 +148,3 @@ def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
     others = ordered["p_value"].iloc[1:]
     sure = others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1
     return ordered, bool(sure)
-
-
-def draw_readings(table: pd.DataFrame, settings: MetricsConfig, look: PlotStyle) -> "Figure":
-    """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
-    environments, lines = list(table["env"].unique()), in_order(table)
-    variants = list(table["variant"].unique())
-    step = min(0.22, 0.8 / len(variants))  # of a line, from variant to variant
-    with style():
-        count, height = len(environments), 0.34 * len(lines) + LEGEND_HEIGHT
-        figure, panels = grid(count, count, "Training episodes", height=height)
-        for environment, axes in zip(environments, panels, strict=True):
-            for place, ((_, _, source), rows) in enumerate(lines):
-                own = rows[rows["env"] == environment].set_index("variant")
-                for name in own.index:
-                    row = own.loc[name]
-                    shift = step * (variants.index(name) - (len(variants) - 1) / 2)
-                    colour = look.colours[name]
-                    axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
-                    axes.plot(
-                        row["mean"],
-                        place + shift,
-                        "o",
-                        markersize=3.5,
-                        color=colour,
-                        markerfacecolor="white" if source == PAPER else colour,
-                        label=look.labels[name] if place == 1 else None,
-                    )
-            for place in range(len(lines) - 1):
-                axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
-            axes.set_xlim(left=-0.03 * axes.get_xlim()[1])  # dots at 0 are whole
-            axes.locator_params(axis="x", nbins=4)
-            axes.set_title(environment)
-        panels[0].set_yticks(
-            range(len(lines)), [title(*key, settings) for key, _ in lines], fontsize="small"
-        )
-        panels[0].invert_yaxis()
-        for axes in panels[1:]:
-            axes.sharey(panels[0])
-            axes.tick_params(labelleft=False)
-        level = f"{100 * look.confidence:g} % interval"
-        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Hollow: the paper.")
-    return figure

@@ -5,16 +5,16 @@ import math
 import numpy as np
 import pandas as pd
 
+from mace_rl.study.claims_config import Table1Config
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.paper import PAPER_METRICS, PAPER_TABLE1
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
 
 
-def summary(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """All metrics averaged over seeds; `table` is the frame of metrics.csv.
+def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) -> pd.DataFrame:
+    """All metrics averaged over seeds; `table` is the frame of metrics.csv, `table1` the paper's.
 
     One row per environment, variant and metric, in the order of `table`: `mean`,
     the bounds `low` and `high` of its interval (NaN with one seed; cut to where its mean must lie,
@@ -24,8 +24,6 @@ def summary(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
-        published = PAPER_TABLE1.get((str(environment), str(variant)), ())
-        paper = dict(zip(PAPER_METRICS, published, strict=False))  # empty if it has none
         for metric in all_metrics(settings):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
             low, high = interval(values, settings)
@@ -42,20 +40,17 @@ def summary(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
                     "seeds": len(values),
                     "censored": int(runs[metric.flag].sum()) if metric.flag in runs else 0,
                     "episodes": int(runs["episodes"].iloc[0]),
-                    "paper": paper.get(metric.name),
+                    "paper": table1.value(str(environment), str(variant), metric.name),
                 }
             )
-    return pd.DataFrame(rows).astype({"paper": "Int64"})
+    frame = pd.DataFrame(rows)
+    return frame.assign(paper=frame["paper"].astype(object).convert_dtypes())  # 186, not 186.0
 
 
-def table1(means: pd.DataFrame) -> pd.DataFrame:
-    """The data of table1.csv: of a `summary` the paper's two metrics."""
-    return means[means["metric"].isin(PAPER_METRICS)]
-
-
-def supplement(means: pd.DataFrame) -> pd.DataFrame:
-    """The data of supplement.csv: the other metrics."""
-    return means[~means["metric"].isin(PAPER_METRICS)]
+def split(means: pd.DataFrame, table1: Table1Config) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """A `summary` as the data of table1.csv, which has the paper's metrics, and supplement.csv."""
+    papers = means["metric"].isin(table1.metrics)
+    return means[papers], means[~papers]
 
 
 def digits_by_metric(table: pd.DataFrame, settings: MetricsConfig) -> dict[tuple[str, str], int]:

@@ -1,29 +1,28 @@
-"""Does what the paper claims hold, and what of our own questions? The rule is in docs/protocol.md.
+"""Do claims hold? The rule is in docs/protocol.md, the claims are in a file: `claims_config`.
 
 A part of a claim, a comparison of two variants, is shown, reversed, absent or open; of these comes
 the verdict on the claim.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import scipy
 
 from mace_rl.runs.records import RecordError
-from mace_rl.study.claims_config import CORRELATION, Claim, Family, Part
+from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, FamilyConfig, Part, Table1Config
+from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import (
     equivalence,
     holm,
     probability_of_improvement,
     stratified_comparison,
 )
-from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.measure.metrics import CORRELATION, Metric, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.paper import FIXED, FULL, PAPER_METRICS, PAPER_TABLE1, PPO, VARIANTS
 
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
@@ -32,68 +31,62 @@ FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
 
-@dataclass
-class Finding:
-    """What was found of one part; differences count in the claim's favour."""
+def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -> list[Answer]:
+    """An answer to each claim that the runs in `table` can answer.
 
-    environments: tuple[str, ...]
-    metric: str
-    variant: str
-    baseline: str | None
-    unit: str  # episodes, return, correlation, or a share of everything
-    seeds: int  # in the environment that has fewest
-    difference: float
-    low: float
-    high: float
-    p_value: float
-    probability: float  # that a run of the variant is better than one of the baseline
-    probability_low: float
-    probability_high: float
-    detectable: float  # what these seeds show with a power of `POWER`, before correction
-    worth_mentioning: float
-    in_paper: float  # the same difference in the paper's Table 1; NaN where that has none
-    p_equivalent: float  # that the difference is not smaller than what is worth mentioning
-    p_holm: float = np.nan
-    p_equivalent_holm: float = np.nan
-    outcome: str = ""  # shown, reversed, absent or open
-
-
-def ledger(
-    table: pd.DataFrame, settings: MetricsConfig, families: Sequence[Family]
-) -> list[dict[str, Any]]:
-    """A record per claim: statement, what the paper's table says, verdicts and `Finding`s.
-
-    table: the frame of metrics.csv with a column `CORRELATION`, and with the families' environments
-    and variants; seeds may differ between environments, not between variants. Of one seed there are
-    no intervals and no tests: NaN.
+    table: the frame of metrics.csv with a column `CORRELATION`; seeds may differ between
+    environments, not between variants. Of one seed there are no intervals and no tests: NaN.
     """
-    return list(chain.from_iterable(_answers(table, settings, family) for family in families))
-
-
-def _answers(table: pd.DataFrame, settings: MetricsConfig, family: Family) -> list[dict[str, Any]]:
-    """The records of one family."""
-    records: list[dict[str, Any]] = [
-        {"family": family.title, "claim": claim.name, "statement": claim.statement}
-        | {"paper": _paper(claim)}
-        for claim in family.claims
+    lacking = claims.lacking(table["env"], table["variant"], settings)
+    return [
+        answer
+        for title, family in claims.families.items()
+        if not lacking[title]
+        for answer in _answers(title, family, claims.table1, table, settings)
     ]
-    for how in family.claims[0].parts:
-        found = [
-            [_find(part, claim, table, settings) for part in claim.parts[how]]
-            for claim in family.claims
-        ]
-        _judge(list(chain.from_iterable(found)))
-        for record, findings in zip(records, found, strict=True):
-            answer = verdict([finding.outcome for finding in findings])
-            parts = [_record(finding) for finding in findings]
-            record[how] = {"outcome": answer, "verdict": family.words[answer], "parts": parts}
-    return records
 
 
-def _record(finding: Finding) -> dict[str, Any]:
-    """A finding for JSON, which has no NaN."""
-    values = asdict(finding)
-    return {key: None if value != value else value for key, value in values.items()}
+def _answers(
+    title: str,
+    family: FamilyConfig,
+    table1: Table1Config,
+    table: pd.DataFrame,
+    settings: MetricsConfig,
+) -> Iterator[Answer]:
+    """The answers to the claims of one family."""
+    words = family.words.model_dump()
+    judged: dict[str, dict[str, Judgement]] = {name: {} for name in family.claims}
+    for how in family.ways:
+        parts = {
+            name: [
+                part for several in claim.parts[how] for part in several.each(claim.table1, table1)
+            ]
+            for name, claim in family.claims.items()
+        }
+        findings = iter(judge(list(chain.from_iterable(parts.values())), table, settings))
+        for name, own in parts.items():
+            found = [next(findings) for _ in own]
+            answer = verdict([finding.outcome for finding in found])
+            judged[name][how] = Judgement(answer, words[answer], found)
+    for name, claim in family.claims.items():
+        paper = _in_paper(claim, table1, settings)
+        yield Answer(title, name, claim.statement, paper, judged[name])
+
+
+def judge(parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig) -> list[Finding]:
+    """The rule: what each part came out as, their p values corrected together.
+
+    Those for a difference and those against one are corrected apart. A part that one seed leaves
+    without a p value counts as one of 1.
+    """
+    findings = [_find(part, table, settings) for part in parts]
+    different = _corrected([finding.p_value for finding in findings])
+    equivalent = _corrected([finding.p_equivalent for finding in findings])
+    corrected = [
+        replace(finding, p_holm=p, p_equivalent_holm=q)
+        for finding, p, q in zip(findings, different, equivalent, strict=True)
+    ]
+    return [replace(finding, outcome=outcome(finding)) for finding in corrected]
 
 
 def verdict(outcomes: Sequence[str]) -> str:
@@ -117,27 +110,14 @@ def outcome(finding: Finding) -> str:
     return "open"
 
 
-def _judge(findings: list[Finding]) -> None:
-    """Correct the p values of all parts together, and say what each came out as.
-
-    Those for a difference and those against one are corrected apart. A part that one seed leaves
-    without a p value counts as one of 1.
-    """
-    different = _corrected([finding.p_value for finding in findings])
-    equivalent = _corrected([finding.p_equivalent for finding in findings])
-    for finding, *p_values in zip(findings, different, equivalent, strict=True):
-        finding.p_holm, finding.p_equivalent_holm = p_values
-        finding.outcome = outcome(finding)
-
-
 def _corrected(p_values: Sequence[float]) -> list[float]:
     """Holm's p values; NaN where there was none."""
     adjusted = holm([1.0 if np.isnan(p) else p for p in p_values])
     return [p if np.isnan(p) else float(q) for p, q in zip(p_values, adjusted, strict=True)]
 
 
-def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
-    """Estimates and tests of one part of a claim."""
+def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
+    """Estimates and tests of one part."""
     metrics = {metric.name: metric for metric in all_metrics(settings)}
     both = table[table["variant"].isin([part.variant, part.baseline])]
     runs = {env: both[both["env"] == env] for env in part.environments}
@@ -157,14 +137,14 @@ def _find(part: Part, claim: Claim, table: pd.DataFrame, settings: MetricsConfig
     margin = WORTH_MENTIONING * everything[0]
     flips = settings.bootstrap_repetitions, np.random.default_rng(seed)
     return Finding(
-        *part,
+        *part[:4],
         unit,
         min(len(difference) for difference in differences),
         *(difference, low, high, p_value),
         *(chance, lowest, highest),
         _detectable(differences),
         margin,
-        _in_paper(part, claim) if unit == "episodes" else np.nan,
+        -part.in_paper if unit == "episodes" else part.in_paper,
         equivalence(differences, margin, *flips),
     )
 
@@ -217,24 +197,13 @@ def _detectable(differences: Sequence[np.ndarray]) -> float:
     return float(quantiles.sum() * error)
 
 
-def _in_paper(part: Part, claim: Claim) -> float:
-    """By how many episodes the variant is earlier than the baseline in the paper's Table 1."""
-    if claim.paper is None or part.baseline is None:
-        return np.nan
-    environment, column = claim.paper
-    variant, baseline = (
-        PAPER_TABLE1[environment, name][column] for name in (part.variant, part.baseline)
-    )
-    return float(baseline - variant)
-
-
-def _paper(claim: Claim) -> str:
+def _in_paper(claim: ClaimConfig, table1: Table1Config, settings: MetricsConfig) -> str:
     """What the paper's own table says of a claim; empty where it says nothing."""
-    if claim.paper is None:
+    if claim.table1 is None:
         return ""
-    environment, column = claim.paper
-    values = {name: PAPER_TABLE1[environment, name][column] for name in VARIANTS}
-    first = min(values, key=values.__getitem__)
-    names = {PPO: "PPO", FIXED: "fixed", FULL: "full"}
-    numbers = ", ".join(f"{names[name]} {value}" for name, value in values.items())
-    return f"{PAPER_METRICS[column]}: {numbers}; the best is {names[first]}"
+    rows, metric = table1.values[claim.table1.environment], claim.table1.metric
+    values = {name: rows[name][table1.metrics.index(metric)] for name in table1.variants}
+    units = {one.name: one.unit for one in all_metrics(settings)}
+    best = (min if units[metric] == "episodes" else max)(values, key=values.__getitem__)
+    numbers = ", ".join(f"{table1.variants[name]} {value}" for name, value in values.items())
+    return f"{metric}: {numbers}; the best is {table1.variants[best]}"

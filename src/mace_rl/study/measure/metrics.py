@@ -24,6 +24,7 @@ PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 
+CORRELATION = "stagnation_correlation"  # of betas.csv, beside the metrics: `METRICS`
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 

@@ -53,6 +53,7 @@ class PlotStyle(NamedTuple):
     confidence: float  # of the intervals
     labels: Mapping[str, str]  # of variants
     colours: Mapping[str, str]  # of variants
+    metrics: Mapping[str, str]  # labels
 
 
 def quantity(figure: str, settings: MetricsConfig) -> Quantity:

@@ -10,23 +10,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from mace_rl.study.claims_config import FROZEN, WAYS, WITHOUT_MEMORY
+from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.aggregate import SCORED
+from mace_rl.study.compare.ledger import Answer, Finding
+from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.verdicts import CONFIDENCE, WORTH_MENTIONING
-from mace_rl.study.measure.metrics import METRICS
+from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.paper import FIXED, FULL, PPO
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
 from mace_rl.study.show.tables import SOLVED
 
-if TYPE_CHECKING:  # drawing is imported where it is used, as in figures
+if TYPE_CHECKING:  # drawing is imported where it is used, as in curves
     from matplotlib.figure import Figure
 
 FIXED_BETA, LEARNED, OTHER = "fixed", "learned", "other"
-METRIC_LABELS = {metric.name: metric.label for metric in METRICS}
-SHORT = {PPO: "PPO", FIXED: "fixed β", FULL: "learned β", FROZEN: "frozen LSTM"}
-SHORT |= {WITHOUT_MEMORY: "without memory"}  # others are called what they are
 # Of parts, and of the verdicts alike; from seaborn's palette that the colour-blind can tell apart.
 OUTCOMES = {
     "shown": ("#029e73", "shown"),
@@ -39,8 +37,18 @@ LINE = 0.75  # the height of a line of words, where a part has 1
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
-def every_seed(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+class Source(NamedTuple):
+    """What the data of pictures are made of."""
+
+    data: Mapping[str, pd.DataFrame]  # by the name of the CSV file: metrics, readings
+    answers: Sequence[Answer]  # the ledger
+    settings: MetricsConfig
+    claims: ClaimsConfig
+
+
+def every_seed(source: Source) -> pd.DataFrame:
     """`SCORED` of every run of metrics.csv. Columns: env, variant, seed, metric, value."""
+    runs = source.data["metrics"]
     long = runs.melt(["env", "variant", "seed"], list(SCORED), "metric", ignore_index=False)
     return long.sort_index(kind="stable").reset_index(drop=True)  # run by run
 
@@ -60,17 +68,18 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> "Figure":
                 dots.set(alpha=0.7, linewidth=0, label=look.labels[name])
                 axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colour)
             axes.set_xticks([])
-            axes.set_title(f"{environment}:\n{METRIC_LABELS[str(metric)].lower()}")
+            axes.set_title(f"{environment}:\n{look.metrics[str(metric)].lower()}")
         legend(figure, "Dot: one seed. Line: their mean.")
     return figure
 
 
-def constants(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+def constants(source: Source) -> pd.DataFrame:
     """The mean return of training of every variant, from the frame of metrics.csv.
 
     Columns: env, variant, role (`FIXED_BETA` in their order, `LEARNED` or `OTHER`), mean over the
     seeds, low, high (its interval), seeds.
     """
+    runs, settings = source.data["metrics"], source.settings
     assert settings.constants is not None  # or nobody asks
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
@@ -120,11 +129,12 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     return figure
 
 
-def solved(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+def solved(source: Source) -> pd.DataFrame:
     """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame.
 
     Columns: env, variant, solved, seeds.
     """
+    runs = source.data["metrics"]
     counted = runs.assign(solved=runs["solved"] >= SOLVED).groupby(["env", "variant"], sort=False)
     return counted["solved"].agg(solved="sum", seeds="size").reset_index()
 
@@ -158,37 +168,39 @@ def draw_solved(table: pd.DataFrame, look: PlotStyle) -> "Figure":
     return figure
 
 
-def forest(ledger: Sequence[Mapping[str, Any]], settings: MetricsConfig) -> pd.DataFrame:
-    """Every part of every claim of claims.json, measured in what would be worth mentioning.
+def forest(source: Source) -> pd.DataFrame:
+    """Every part of every claim of the ledger, measured in what would be worth mentioning.
 
-    Columns: measured (one of `WAYS`), claim, statement, verdict and answer (of the claim, in its
+    Columns: measured (in which way), claim, statement, verdict and answer (of the claim, in its
     own words and in those of parts), part (what tells it from the claim's others), metric, seeds,
     difference, low, high, paper (the same in the paper's Table 1; NaN where that has none), outcome
     (of the part). More is in the claim's favour.
     """
     rows = []
-    for how in WAYS:
-        for claim in (claim for claim in ledger if how in claim):
-            parts, answer = claim[how]["parts"], claim[how]["outcome"]
-            common = (how, claim["claim"], claim["statement"], claim[how]["verdict"], answer)
-            for part in parts:
-                values = [part[key] for key in ("difference", "low", "high", "in_paper")]
-                unit = part["worth_mentioning"]
-                scaled = [np.nan if value is None else value / unit for value in values]
-                measured = (_what(part, parts), part["metric"], part["seeds"])
-                rows.append((*common, *measured, *scaled, part["outcome"]))
+    for how in dict.fromkeys(how for answer in source.answers for how in answer.ways):
+        for answer in (answer for answer in source.answers if how in answer.ways):
+            judged = answer.ways[how]
+            common = (how, answer.claim, answer.statement, judged.verdict, judged.outcome)
+            for part in judged.parts:
+                values = part.difference, part.low, part.high, part.in_paper
+                scaled = [value / part.worth_mentioning for value in values]
+                measured = (_what(part, judged.parts, source), part.metric, part.seeds)
+                rows.append((*common, *measured, *scaled, part.outcome))
     columns = ["measured", "claim", "statement", "verdict", "answer", "part", "metric", "seeds"]
     columns += ["difference", "low", "high", "paper", "outcome"]
     return pd.DataFrame(rows, columns=columns)
 
 
-def _what(part: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> str:
+def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     """What tells a part from the others of its claim."""
-    differ = {key for key in ("environments", "metric") if any(p[key] != part[key] for p in parts)}
-    words = [name.partition("-")[0] for name in part["environments"] if "environments" in differ]
-    words += [METRIC_LABELS[part["metric"]].lower()] if "metric" in differ else []
-    baseline = part["baseline"]
-    words += [f"over {SHORT.get(baseline, baseline.replace('beta_', 'β = '))}"] if baseline else []
+    words = []
+    if any(other.environments != part.environments for other in parts):
+        words += [name.partition("-")[0] for name in part.environments]
+    if any(other.metric != part.metric for other in parts):
+        labels = {metric.name: metric.label for metric in all_metrics(source.settings)}
+        words.append(labels.get(part.metric, part.metric).lower())
+    if part.baseline:
+        words.append(f"over {source.claims.variants.get(part.baseline, part.baseline)}")
     return ", ".join(words)
 
 
@@ -266,16 +278,64 @@ def _placed(
     return table.assign(place=pd.concat(placed)), blocks
 
 
-class Picture(NamedTuple):
-    """What makes the data of a picture, of metrics.csv's frame or the claims, and what draws it."""
+def draw_readings(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+    """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
+    environments, lines = list(table["env"].unique()), in_order(table)
+    variants = list(table["variant"].unique())
+    step = min(0.22, 0.8 / len(variants))  # of a line, from variant to variant
+    with style():
+        count, height = len(environments), 0.34 * len(lines) + LEGEND_HEIGHT
+        figure, panels = grid(count, count, "Training episodes", height=height)
+        for environment, axes in zip(environments, panels, strict=True):
+            for place, ((_, _, source), rows) in enumerate(lines):
+                own = rows[rows["env"] == environment].set_index("variant")
+                for name in own.index:
+                    row = own.loc[name]
+                    shift = step * (variants.index(name) - (len(variants) - 1) / 2)
+                    colour = look.colours[name]
+                    axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
+                    axes.plot(
+                        row["mean"],
+                        place + shift,
+                        "o",
+                        markersize=3.5,
+                        color=colour,
+                        markerfacecolor="white" if source == PAPER else colour,
+                        label=look.labels[name] if place == 1 else None,
+                    )
+            for place in range(len(lines) - 1):
+                axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
+            axes.set_xlim(left=-0.03 * axes.get_xlim()[1])  # dots at 0 are whole
+            axes.locator_params(axis="x", nbins=4)
+            axes.set_title(environment)
+        panels[0].set_yticks(
+            range(len(lines)), [title(*key, look.metrics) for key, _ in lines], fontsize="small"
+        )
+        panels[0].invert_yaxis()
+        for axes in panels[1:]:
+            axes.sharey(panels[0])
+            axes.tick_params(labelleft=False)
+        level = f"{100 * look.confidence:g} % interval"
+        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Hollow: the paper.")
+    return figure
 
-    data: Callable[[Any, MetricsConfig], pd.DataFrame]
+
+class Picture(NamedTuple):
+    """What makes the data of a picture, what draws it, and whether there is anything to draw."""
+
+    data: Callable[[Source], pd.DataFrame]
     draw: Callable[[pd.DataFrame, PlotStyle], "Figure"]
+    fits: Callable[[Source], bool]
 
 
 PICTURES = {
-    "every_seed": Picture(every_seed, draw_every_seed),
-    "constants": Picture(constants, draw_constants),
-    "solved": Picture(solved, draw_solved),
-    "forest": Picture(forest, draw_forest),
+    "every_seed": Picture(every_seed, draw_every_seed, lambda source: True),
+    "constants": Picture(constants, draw_constants, lambda source: bool(source.settings.constants)),
+    "solved": Picture(solved, draw_solved, lambda source: bool(source.settings.solved_return)),
+    "forest": Picture(forest, draw_forest, lambda source: bool(source.answers)),
+    "readings": Picture(
+        lambda source: source.data["readings"],
+        draw_readings,
+        lambda source: "readings" in source.data,
+    ),
 }

@@ -1,10 +1,12 @@
-"""The page itself: what the template `page.html` shows, from a study's outputs.
+"""The report: what the template `report.html` shows, from a study's outputs.
 
 One file that needs nothing else: pictures and styles stand in it, there is no script, and its
 content security policy has the browser refuse whatever would be loaded.
 """
 
+import html
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,26 +15,27 @@ from typing import Any
 
 import jinja2
 import pandas as pd
+from markupsafe import Markup
 from matplotlib.colors import to_hex
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.study.compare.readings import draw_readings
+from mace_rl.runs.progress import duration
+from mace_rl.study.claims_config import ClaimsConfig
+from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.compare.verdicts import FEWEST_SEEDS, POWER
+from mace_rl.study.compare.verdicts import FEWEST_SEEDS
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
-from mace_rl.study.show import markdown as pages
-from mace_rl.study.show import tables
+from mace_rl.study.show import sections, tables
 from mace_rl.study.show.animations import Animation
-from mace_rl.study.show.cells import as_html, number
+from mace_rl.study.show.cells import Cell, number
 from mace_rl.study.show.curves import PlotStyle, quantity, style
-from mace_rl.study.show.markdown import Data, Ledger
-from mace_rl.study.show.pictures import PICTURES
+from mace_rl.study.show.pictures import PICTURES, Source
+from mace_rl.study.show.sections import Data, Section
 from mace_rl.study.show.svg import PAGE_COLOURS, panels, svg
 
 TEMPLATE = Path(__file__).with_name("report.html")
 FIGURES = ("1", "2")
-MINUTE, HOUR = 60, 3600
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,9 @@ class Provenance:
 
 def page(
     data: Data,
-    claims: Ledger,
-    making: Provenance,
+    answers: Sequence[Answer],
+    claims: ClaimsConfig,
+    provenance: Provenance,
     animations: tuple[Mapping[str, Sequence[Animation]], Sequence[str]],
     settings: MetricsConfig,
     look: PlotStyle,
@@ -61,18 +65,19 @@ def page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"short": short, "duration": duration, "table": as_html}
-    metrics, records = data["metrics"], making.records
+    environment.filters |= {"three_digits": three_digits, "table": as_html, "note": _note}
+    metrics, records = data["metrics"], provenance.records
+    names = dict(look.labels) | {metric.name: metric.label for metric in all_metrics(settings)}
     return environment.get_template(TEMPLATE.name).render(
-        families=pages.families(claims),
-        counted=pages.counted,
-        ways=pages.ways,
+        claims=claims,
+        families=sections.by_family(answers),
+        counted=sections.counted,
+        parts=lambda answer, how: tables.parts([answer], how, names).iloc[:, 1:],
+        parts_note=sections.PARTS,
         fewest=FEWEST_SEEDS,
-        power=POWER,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),
         runs=len(records),
-        seconds=sum(record["seconds"] for record in records),
-        interruptions=sum(len(record["interruptions"]) for record in records),
+        time=duration(sum(record["seconds"] for record in records)),
         confidence=f"{100 * settings.confidence:g} %",
         window=settings.moving_average,
         environments=list(metrics["env"].unique()),
@@ -83,26 +88,51 @@ def page(
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
         shown=animations[0],
         missing=animations[1],
-        pictures=_pictures(data, claims, settings, look),
-        tables=_tables(data, making, settings, look.labels),
-        parts=lambda claim, how: _parts(claim, how, settings, look.labels),
-        making=making,
+        pictures=_pictures(Source(data, answers, settings, claims), look),
+        sections=_sections(data, claims, provenance, settings, look.labels),
+        provenance=provenance,
         origins=_origins(records),
     )
 
 
-def short(value: float) -> str:
+def three_digits(value: float) -> str:
     """A return with three significant digits, or all that stand before the point."""
     digits = 2 - math.floor(math.log10(abs(value))) if value else 0
     return number(value, max(digits, 0))
 
 
-def duration(seconds: float) -> str:
-    """A time in the unit that suits it."""
-    for unit, length in (("h", HOUR), ("min", MINUTE)):
-        if seconds >= length:
-            return f"{number(seconds / length, 1)} {unit}"
-    return f"{number(seconds, 1)} s"
+def as_html(frame: pd.DataFrame) -> Markup:
+    """A table as HTML, for the style sheet of the report: words left, numbers right."""
+    rows = [[_html(cell) for cell in row] for row in frame.to_numpy()]
+    words = [all(isinstance(cell, str) for cell in frame.iloc[:, i]) for i in range(len(frame.T))]
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        left = [' class="left"' if word else "" for word in words]
+        whole = "".join(f"<{tag}{x}>{cell}</{tag}>" for x, cell in zip(left, cells, strict=True))
+        return f"<tr>{whole}</tr>"
+
+    head = line("th", [html.escape(name) for name in frame.columns])
+    body = [line("td", row) for row in rows]
+    lines = ["<thead>", head, "</thead>", "<tbody>", *body, "</tbody>"]
+    return Markup('<div class="scroll"><table class="data">' + "\n".join(lines) + "</table></div>")
+
+
+def _html(cell: str | Cell) -> str:
+    if isinstance(cell, str):
+        return html.escape(cell)
+    texts = [
+        f'<span class="nowrap{" best" if one.best else ""}">{html.escape(one.text)}'
+        f"<sup>{one.mark}</sup></span>"
+        for one in cell.values
+    ]
+    intervals = [f"{one.low} to {one.high}" for one in cell.values if one.low]
+    below = [cell.joint.join(intervals), html.escape(cell.note)]
+    return cell.joint.join(texts) + "".join(f"<small>{line}</small>" for line in below if line)
+
+
+def _note(text: str) -> Markup:
+    """The note of a section, of which words between asterisks are italic."""
+    return Markup(re.sub(r"\*([^*]+)\*", r"<i>\1</i>", html.escape(text)))
 
 
 def _panels(data: Data, figure: str, settings: MetricsConfig, look: PlotStyle) -> dict[str, str]:
@@ -111,80 +141,49 @@ def _panels(data: Data, figure: str, settings: MetricsConfig, look: PlotStyle) -
     return panels(curves, seeds, quantity(figure, settings), look)
 
 
-def _pictures(
-    data: Data,
-    claims: Ledger,
-    settings: MetricsConfig,
-    look: PlotStyle,
-) -> dict[str, str]:
+def _pictures(source: Source, look: PlotStyle) -> dict[str, str]:
     """Those that are wider than a phone, as SVG by name; those that this study has data for."""
     look = look._replace(layout=FigureConfig(columns=3))
-    made_of = {
-        "every_seed": data["metrics"],
-        "constants": data["metrics"] if settings.constants else None,
-        "solved": data["metrics"] if settings.solved_return else None,
-        "forest": claims or None,
+    drawn = {
+        name: picture.draw(picture.data(source), look)
+        for name, picture in PICTURES.items()
+        if picture.fits(source)
     }
-    drawn = {"readings": draw_readings(data["readings"], settings, look)}
-    for name, found in made_of.items():
-        if found is not None:
-            drawn[name] = PICTURES[name].draw(PICTURES[name].data(found, settings), look)
     return {name: svg(figure, name, name.replace("_", " ")) for name, figure in drawn.items()}
 
 
-def _tables(
-    data: Data, making: Provenance, settings: MetricsConfig, labels: Mapping[str, str]
-) -> dict[str, Any]:
-    """Every table, by its name in the template."""
-    costs = _costs(making.records, data["metrics"], labels)
-    data = {name: tables.named(frame, labels) for name, frame in data.items()}
+def _sections(
+    data: Data,
+    claims: ClaimsConfig,
+    provenance: Provenance,
+    settings: MetricsConfig,
+    labels: Mapping[str, str],
+) -> dict[str, Section]:
+    """Every table but the ledger's, by its title, and three that the pages of Markdown have not."""
+    compared = tables.named(data["comparisons"], labels)
     means = pd.concat([data["table1"], data["supplement"]])
-    return {
-        "table1": tables.table1(data["table1"]),
-        "readings": tables.readings(data["readings"], settings),
-        "aggregate": tables.aggregate(data["aggregate"]),
-        "comparisons": tables.comparisons(data["comparisons"], means, settings),
-        "companions": tables.companions(data["supplement"], settings),
-        "costs": costs,
-        "ppo": tables.table2(making.ppo),
-    }
-
-
-def _parts(
-    claim: Mapping[str, Any], how: str, settings: MetricsConfig, labels: Mapping[str, str]
-) -> pd.DataFrame:
-    """The parts of one claim."""
-    names = dict(labels) | {metric.name: metric.label for metric in all_metrics(settings)}
-    return tables.parts([claim], how, names).iloc[:, 1:]
-
-
-def _costs(
-    records: Sequence[Mapping[str, Any]], metrics: pd.DataFrame, labels: Mapping[str, str]
-) -> pd.DataFrame:
-    """What the runs of each environment and variant took, by their `run.json`."""
-    frame = pd.DataFrame(
-        [
-            {key: record["config"][key] for key in ("environment", "variant", "seed")}
-            | {key: record[key] for key in ("seconds", "peak_memory_mb")}
-            for record in records
-        ]
-    ).rename(columns={"environment": "env"})
-    frame = frame.merge(metrics[["env", "variant", "seed", "env_steps"]], validate="1:1")
-    rows = [
-        [
-            env,
-            labels[str(variant)],
-            number(len(own)),
-            number(own["env_steps"].sum() / 1000),
-            duration(own["seconds"].median()),
-            duration(own["seconds"].max()),
-            duration(own["seconds"].sum()),
-            number(own["peak_memory_mb"].max()),
-        ]
-        for (env, variant), own in frame.groupby(["env", "variant"], sort=False)
+    note = (
+        "Differences are paired by seed, with Holm's correction over the whole table. *P* is the"
+        " probability that a run of the first is better than one of the second."
+    )
+    costs = tables.costs(provenance.records, data["metrics"], labels)
+    interruptions = sum(len(record["interruptions"]) for record in provenance.records)
+    machine = "As each run's run.json has it; one core a run, no GPU."
+    found = [
+        *sections.of_runs(data, claims, settings, labels),
+        Section(
+            "Variants against each other, on every metric",
+            note,
+            tables.comparisons(compared, means, settings),
+        ),
+        Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
+        Section(
+            "PPO's settings, as resolved",
+            "Table 2; for LaTeX table2.tex.",
+            tables.table2(provenance.ppo, claims.table2),
+        ),
     ]
-    heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
-    return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
+    return {section.title: section for section in found}
 
 
 def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, int]]]:

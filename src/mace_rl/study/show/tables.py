@@ -1,7 +1,7 @@
-"""Every table of a study: the data of table1.csv and supplement.csv, and frames of cells.
+"""Every table of a study, as a frame of cells.
 
 A frame of cells has a table's heads as columns and what is printed as values: words (`str`) and
-`Cell`s. `renderings` makes Markdown, HTML and LaTeX of it. Variants are called what they are called
+`Cell`s. `markdown`, `report` and `latex` print it. Variants are called what they are called
 in the data: `named` gives them other names first.
 """
 
@@ -12,25 +12,20 @@ from typing import Any
 import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
-from mace_rl.study.claims_config import WAYS
+from mace_rl.runs.progress import duration
+from mace_rl.study.claims_config import Table1Config
+from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.paper import PAPER_METRICS
 from mace_rl.study.show.cells import Cell, Value, estimate, number
 
+CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
 
-PAPER_SETTINGS = {  # Paper, Table 2, in its order; the optimiser, Adam, is the last
-    "actor_learning_rate": "Actor Learning Rate",
-    "critic_learning_rate": "Critic Learning Rate",
-    "discount": "Discount Factor (\u03b3)",
-    "epochs": "PPO Epochs (\U0001d43e)",
-    "clip": "PPO Clip Parameter (ε)",
-}
 OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is named after its key
     "gae_lambda": "GAE Parameter (λ)",
     "rollout_steps": "Steps per Update, at least (whole episodes)",
@@ -55,28 +50,46 @@ def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
     return table.assign(**{column: table[column].replace(dict(names)) for column in columns})
 
 
-def table1(table: pd.DataFrame) -> pd.DataFrame:
-    """Table 1 in the paper's layout, of `summary.table1`: sample efficiency / convergence steps.
+def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) -> pd.DataFrame:
+    """Table 1 in the paper's layout, of the data of table1.csv: its metrics side by side.
 
-    Rows are variants, columns environments. The lowest mean of each environment and metric is the
-    best, as displayed; ties all are, and a mean of seeds that all never got there is not. The
-    paper's numbers stand beside.
+    Rows are variants, columns environments. The best mean of each environment and metric is bold,
+    as displayed; ties all are, and a mean of seeds that all never got there is not. The paper's
+    numbers stand beside.
     """
-    best = {
-        key: number(group["mean"].min())
-        for key, group in table[table["censored"] < table["seeds"]].groupby(["env", "metric"])
-    }
+    digits, units = (
+        digits_by_metric(table, settings),
+        {metric.name: metric.unit for metric in all_metrics(settings)},
+    )
+    best = {}
+    attained = table[table["censored"] < table["seeds"]]
+    for (env, metric), group in attained.groupby(["env", "metric"]):
+        key = str(env), str(metric)
+        first = group["mean"].min() if units[key[1]] == "episodes" else group["mean"].max()
+        best[key] = number(first, digits[key])
+
+    def mean(row: pd.Series) -> Value:
+        key = row["env"], row["metric"]
+        some = row["censored"] < row["seeds"]
+        return _mean(row, digits[key], some and number(row["mean"], digits[key]) == best[key])
 
     def cell(runs: pd.DataFrame) -> Cell:
-        rows = [runs[runs["metric"] == metric].iloc[0] for metric in PAPER_METRICS]
-        means = [
-            _mean(row, 0, row["censored"] < row["seeds"] and number(row["mean"]) == best[key])
-            for row, key in ((row, (row["env"], row["metric"])) for row in rows)
+        rows = [runs[runs["metric"] == metric].iloc[0] for metric in paper.metrics]
+        published = [
+            number(row["paper"], digits[row["env"], row["metric"]])
+            for row in rows
+            if not pd.isna(row["paper"])
         ]
-        published = " / ".join(number(row["paper"]) for row in rows if not pd.isna(row["paper"]))
-        return Cell(means, note=f"paper: {published}" if published else "")
+        note = f"paper: {' / '.join(published)}" if published else ""
+        return Cell([mean(row) for row in rows], note=note)
 
     return _grid(table, cell, "Algorithm")
+
+
+def counts_episodes(settings: MetricsConfig, paper: Table1Config) -> bool:
+    """Whether all metrics of Table 1 do, of which fewer are better."""
+    units = {metric.name: metric.unit for metric in all_metrics(settings)}
+    return all(units[metric] == "episodes" for metric in paper.metrics)
 
 
 def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.DataFrame]:
@@ -174,7 +187,7 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         ]
         return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
 
-    parts = [own.assign(title=title(*key, settings)) for key, own in in_order(table)]
+    parts = [own.assign(title=title(*key, _labels(settings))) for key, own in in_order(table)]
     frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
     return frame[["episodes", *table["env"].unique()]]
 
@@ -197,60 +210,89 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=heads)
 
 
-def verdicts(claims: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
     """A verdict for each claim of one family, in each way to measure it."""
-    ways = [how for how in WAYS if how in claims[0]]
+    ways = list(answers[0].ways)
     rows = [
         [
-            claim["claim"],
-            claim["statement"],
-            *(Cell([Value(claim[how]["verdict"], best=True)]) for how in ways),
-            claim["paper"],
+            answer.claim,
+            answer.statement,
+            *(Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways),
+            answer.paper,
         ]
-        for claim in claims
+        for answer in answers
     ]
     frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
-    return frame if any(claim["paper"] for claim in claims) else frame.iloc[:, :-1]
+    return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
 
 
-def parts(claims: Sequence[Mapping[str, Any]], how: str, names: Mapping[str, str]) -> pd.DataFrame:
-    """Every part of the claims, measured in one of the two ways, with these `names`, if any."""
+def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.DataFrame:
+    """Every part of the claims, measured in one of the ways, with these `names`, if any."""
     rows = []
-    for claim in claims:
-        for part in claim[how]["parts"]:
+    for answer in answers:
+        for part in answer.ways[how].parts:
             # Of a return as many as the margin needs, which depends on the environment's scale.
-            of_return = max(1, 1 - math.floor(math.log10(part["worth_mentioning"])))
-            digits = {"episodes": 0, "return": of_return}.get(part["unit"], 3)
-            pair = (names.get(name, name) for name in (part["variant"], part["baseline"] or "0"))
-            margins = ("in_paper", "worth_mentioning", "detectable")
+            of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
+            digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
+            pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
+            margins = (part.in_paper, part.worth_mentioning, part.detectable)
             rows.append(
                 [
-                    claim["claim"],
-                    "all" if len(part["environments"]) > 1 else part["environments"][0],
-                    names.get(part["metric"], part["metric"]),
+                    answer.claim,
+                    "all" if len(part.environments) > 1 else part.environments[0],
+                    names.get(part.metric, part.metric),
                     " over ".join(pair),
-                    _number(part["seeds"]),
-                    _estimate(part, "difference", digits, ends=""),
-                    _number(part["p_holm"], 3),
-                    _number(part["p_equivalent_holm"], 3),
-                    _estimate(part, "probability", 2),
-                    *(_number(part[name], digits) for name in margins),
-                    part["outcome"],
+                    _number(part.seeds),
+                    Cell([estimate(part.difference, part.low, part.high, digits)]),
+                    _number(part.p_holm, 3),
+                    _number(part.p_equivalent_holm, 3),
+                    Cell(
+                        [estimate(part.probability, part.probability_low, part.probability_high, 2)]
+                    ),
+                    *(_number(value, digits) for value in margins),
+                    part.outcome,
                 ]
             )
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
 
 
-def table2(ppo: Mapping[str, PPOConfig]) -> pd.DataFrame:
+def costs(
+    records: Sequence[Mapping[str, Any]], runs: pd.DataFrame, labels: Mapping[str, str]
+) -> pd.DataFrame:
+    """What the runs of each environment and variant took, by their `run.json`."""
+    frame = pd.DataFrame(
+        [
+            {key: record["config"][key] for key in ("environment", "variant", "seed")}
+            | {key: record[key] for key in ("seconds", "peak_memory_mb")}
+            for record in records
+        ]
+    ).rename(columns={"environment": "env"})
+    frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
+    rows = [
+        [
+            env,
+            labels[str(variant)],
+            number(len(own)),
+            number(own["env_steps"].sum() / 1000),
+            *(duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")),
+            number(own["peak_memory_mb"].max()),
+        ]
+        for (env, variant), own in frame.groupby(["env", "variant"], sort=False)
+    ]
+    heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
+    return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
+
+
+def table2(ppo: Mapping[str, PPOConfig], papers: Mapping[str, str]) -> pd.DataFrame:
     """The PPO hyperparameters, from the resolved settings of each environment.
 
-    The paper's six rows, then this project's further settings. A value that is not the same in all
-    environments is shown for each.
+    The rows of the paper, by what they are called there, and Adam; then this project's further
+    settings. A value that is not the same in all environments is shown for each.
     """
-    own = [name for name in PPOConfig.model_fields if name not in PAPER_SETTINGS]
+    own = [name for name in PPOConfig.model_fields if name not in papers]
     rows: list[list[str | Cell]]
-    rows = [[label, _setting(ppo, name)] for name, label in PAPER_SETTINGS.items()]
+    rows = [[label, _setting(ppo, name)] for name, label in papers.items()]
     rows.append(["Optimizer", "Adam"])
     rows += [
         [OWN_SETTINGS.get(name, name.replace("_", " ").title()), _setting(ppo, name)]
