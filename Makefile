@@ -1,8 +1,10 @@
 # From a clean clone to the paper's table and figure. `make help` lists what there is.
 # Every target sets up .venv first, which is silent and instant when there is nothing to do.
 
-# Makes .venv; one that is there keeps the Python that it was made with.
+# Makes .venv; one that is there keeps the Python that it was made with. Where nobody names one and
+# there is none, uv fetches one.
 PYTHON ?= python3.11
+UV := uv==0.13.8
 # How many jobs, or processes of tests, run at once: a number, or all the machine has.
 CORES ?= all
 
@@ -27,7 +29,7 @@ PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxp
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick test-wheel tables report bench verify cross-cpu kill-test slurm-test archive lint lock audit clean help setup
+.PHONY: all quick test test-quick test-wheel tables report bench verify cross-cpu kill-test slurm-test archive image-test lint lock audit clean help setup fetched
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -71,6 +73,9 @@ kill-test: setup ## kill trainings at bad moments and compare to the bit (minute
 slurm-test: setup ## the reduced study on a Slurm cluster of one node, compared to the bit (minutes)
 	@$(IN_VENV) pytest -sv -m slurm
 
+image-test: ## build Containerfile's image with buildah and run it without network, as root (minutes)
+	@.ci/image
+
 archive: setup ## the committed tree with checksums as dist/mace-rl-VERSION.tar, for a DOI
 	@$(IN_VENV) tools.deposit
 
@@ -95,21 +100,59 @@ PROJECT := .venv/project-$(call digest,pyproject.toml)
 # Python makes byte code of what is imported, when it is.
 INSTALL := .venv/bin/python -m pip install --no-deps --no-build-isolation --no-compile
 
+# Where else a Python 3.11 may be, if nobody named one.
+ELSE := $(if $(filter file,$(origin PYTHON)),python3 "$$PWD"/.python/*/bin/python3.11)
+
 setup: ## only create .venv from environment.lock
 	@[ -e .venv/bin/python ] || rm -f .venv/packages-* .venv/project-* # its Python may be gone
 	[ ! -e $(PACKAGES) ] || [ ! -e $(PROJECT) ] || exit 0
-	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || {
-	    echo "This needs Python 3.11, and '$(PYTHON)' is not: install it (Debian 12: apt install python3.11" \
-	        "python3.11-venv; elsewhere pyenv or uv have it) or name one: make PYTHON=/path/to/python3.11" >&2
+	exec {lock}>>environment.lock # on a network's disk it has to be open for writing
+	flock "$$lock"
+	[ ! -e $(PACKAGES) ] || [ ! -e $(PROJECT) ] || exit 0 # made by another one, meanwhile
+	export PYTHON
+	for PYTHON in "$(PYTHON)" $(ELSE); do
+	    ! "$$PYTHON" -c 'import ensurepip, sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || break
+	    PYTHON=
+	done
+	$(if $(ELSE),[ "$$PYTHON" ] || PYTHON=$$($(MAKE) --silent fetched); [ "$$PYTHON" ] || exit)
+	[ "$$PYTHON" ] || {
+	    echo "This needs Python 3.11, and '$(PYTHON)' is not, or lacks venv (Debian 12: apt install" \
+	        "python3.11-venv): name another, make PYTHON=/path/to/python3.11, or none, and make fetches one" >&2
 	    exit 1
 	}
 	echo "Setting up .venv (once: a minute, or several GB if pip finds no CPU build of torch) ..." >&2
-	flock environment.lock bash -c '$(MAKE) --silent $(PROJECT) >setup.log 2>&1' || {
+	$(MAKE) --silent $(PROJECT) >setup.log 2>&1 || {
 	    tail -n 15 setup.log >&2
 	    echo "The set-up failed, as shown; the whole output is in setup.log" >&2
 	    exit 1
 	}
 	rm -f setup.log
+
+# Prints the path of a Python 3.11 that uv has, or brings into .python. A uv that is not there comes
+# into an environment that is removed afterwards, made by a Python of any version.
+fetched:
+	@exec 3>&1 4>&2 >setup.log 2>&1
+	failed() {
+	    echo "This needs Python 3.11: there is none, and $$1 (setup.log says why). Install it (Debian 12: apt" \
+	        "install python3.11-venv; elsewhere pyenv or uv have it) or name it: make PYTHON=/path/to/python3.11" >&4
+	    exit 0 # and prints no path: the message is enough
+	}
+	if command -v uv; then
+	    uv=uv
+	else
+	    folder=$$(mktemp -d)
+	    trap 'rm -rf "$$folder"' EXIT
+	    python3 -m venv "$$folder" ||
+	        failed "python3 makes no environment for uv, which would fetch it (Debian, Ubuntu: apt install python3-venv)"
+	    "$$folder/bin/python" -m pip install --quiet $(UV) || failed "pip cannot install uv, which would fetch it"
+	    uv=$$folder/bin/uv
+	fi
+	export UV_PYTHON_PREFERENCE=only-managed UV_PYTHON_INSTALL_BIN=0
+	"$$uv" python find --system 3.11 >&3 && exit
+	echo "No Python 3.11 here: uv fetches one into .python, for this project alone ..." >&4
+	export UV_PYTHON_INSTALL_DIR="$$PWD/.python"
+	"$$uv" python install 3.11 || failed "uv cannot fetch it"
+	"$$uv" python find --system 3.11 >&3
 
 $(PACKAGES):
 	@rm -f .venv/packages-* .venv/project-*
@@ -135,7 +178,7 @@ $(PROJECT): $(PACKAGES)
 define throwaway
 folder=$$(mktemp -d)
 trap 'rm -rf "$$folder"' EXIT
-"$(PYTHON)" -m venv "$$folder"
+$(or $(wildcard .venv/bin/python),"$(PYTHON)") -m venv "$$folder"
 "$$folder/bin/python" -m pip install --quiet $(1)
 endef
 
@@ -146,7 +189,7 @@ TORCH := torch==2.13.0
 TORCH_CPU_HASH := sha256:6746dbcbeb526eb61330b76b41ff1b4eb848951103a892eeb080dfa2b264667b
 
 lock: ## write environment.lock anew from pyproject.toml (UPGRADE=1: take newer releases)
-	@$(call throwaway,uv==0.13.8)
+	@$(call throwaway,$(UV))
 	cat environment.lock environment-cuda.lock >"$$folder/lock"
 	unset $${!UV_@} # the machine's settings must not show in the lock
 	"$$folder/bin/python" -m uv pip compile pyproject.toml --python-version=3.11 \
@@ -171,7 +214,7 @@ audit: ## known vulnerabilities of what the locks pin (asks a vulnerability serv
 	    --progress-spinner=off -r environment.lock -r environment-cuda.lock
 
 clean: ## remove the environments and caches; never results/ or Snakemake's records
-	@rm -rf .venv .venv-purejaxrl setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	@rm -rf .venv .venv-purejaxrl .python setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
 
 help: ## this list

@@ -8,7 +8,7 @@ Defaults of the command line are in profiles/default/config.yaml.
 """
 
 
-configfile: "config.yaml"
+configfile: f"{workflow.basedir}/config.yaml"
 
 
 include: "workflow/rules/study.smk"

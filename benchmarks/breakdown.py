@@ -12,23 +12,28 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, Scale, in_fresh_process
+from benchmarks.measuring import (
+    CARTPOLE,
+    ENVIRONMENTS,
+    FIRST_SEED,
+    HOPPER,
+    Scale,
+    in_fresh_process,
+)
 from benchmarks.speed import OURS, our_config, warm_up
 from mace_rl.environments import classic_control
-from mace_rl.study.paper import CARTPOLE, HOPPER
 
 # Each part with its functions as they hang on a Trainer. What no function here accounts for is
 # bookkeeping.
 SECTIONS = {
     "environment": "environment.env.reset environment.env.step",
-    "acting": "",  # see `instrument`
+    "acting": "",  # see `instrument` and `FUNCTIONS`, as for the updates
     "bookkeeping": "",
     "critics' values, advantages": "ppo.advantages_and_returns",
-    "update: actor": "ppo.improve_policy",
-    "update: critics": "ppo.critics.extrinsic.learn",
+    "update: actor": "",
+    "update: critics": "",
 }
 BONUS = {
-    "update: critics": "ppo.critics.intrinsic.learn",
     "novelty: k-NN": "curiosity.novelty.knn_novelty curiosity.novelty._replace_redundant",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.refresh",
     "memory": "curiosity.memory.recall curiosity.memory.write",
@@ -38,7 +43,9 @@ ALL_SECTIONS = list(SECTIONS | BONUS)
 # Functions of modules: section, module, name.
 FUNCTIONS = (
     ("acting", "mace_rl.trainer", "draw_noise"),
-    ("acting", "mace_rl.agent.kernels", "act_box"),
+    ("acting", "mace_rl.agent.policy", "act_box"),
+    ("update: actor", "mace_rl.agent.compiled_learner", "improve_policy"),
+    ("update: critics", "mace_rl.agent.compiled_learner", "improve_values"),
     ("memory", "mace_rl.bonus.curiosity", "relevance"),
 )
 

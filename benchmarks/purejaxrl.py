@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import speed
-from benchmarks.measuring import FIRST_SEED, ROOT, THREADS, Scale
+from benchmarks.measuring import ACROBOT, CARTPOLE, FIRST_SEED, ROOT, THREADS, Scale
 from benchmarks.speed import OURS, REFERENCE, our_config
-from mace_rl.study.paper import ACROBOT, CARTPOLE
 
 ENVIRONMENTS = (CARTPOLE, ACROBOT)
 # Its contestants: environments side by side, steps of each in a rollout, minibatches.
@@ -130,7 +129,9 @@ def set_up() -> None:
 
 def carry_out(failure: str, *command: str, error: type[BaseException] = SystemExit) -> str:
     """What the command prints; if it fails, `error` says `failure` and what it complained of."""
-    variables = os.environ | VARIABLES
+    # GIT_DIR and the like would let git work in another repository than the clone.
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    variables = own | VARIABLES
     done = subprocess.run(
         command, cwd=ROOT, env=variables, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )

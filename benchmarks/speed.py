@@ -12,8 +12,15 @@ import gymnasium
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
-from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, ROOT, Scale, in_fresh_process, memory_mb
-from mace_rl.study.paper import HOPPER
+from benchmarks.measuring import (
+    ENVIRONMENTS,
+    FIRST_SEED,
+    HOPPER,
+    ROOT,
+    Scale,
+    in_fresh_process,
+    memory_mb,
+)
 
 if TYPE_CHECKING:  # imported where it is used: the others' memory should not hold it
     from mace_rl.config.run import RunConfig

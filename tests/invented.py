@@ -12,9 +12,9 @@ from mace_rl.config.section import check
 from mace_rl.study.claims_config import parts_of, read_claims
 from mace_rl.study.compare.aggregate import SCORED
 from mace_rl.study.compare.ledger import Finding
+from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import CORRELATION, Metric, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.config import read_study
 
 SETTINGS = {
     "final_fraction": 0.1,

@@ -16,12 +16,13 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 from mace_rl import cli
-from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork
-from mace_rl.agent.policy import Policy
-from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetworks
+from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
+from mace_rl.beta.lstm import CompiledMetaNetwork
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.files import LOCK
+from mace_rl.numerics.network import CompiledMLP, Network, TorchNetwork
+from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.trainer import Trainer
 
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
@@ -41,7 +42,7 @@ GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes":
 class Twin:
     """A network, or a policy, as its torch module in float64: outputs, gradients by autograd."""
 
-    def __init__(self, owner: Network | MetaNetworks | Policy) -> None:
+    def __init__(self, owner: Network | CompiledMetaNetwork | Policy) -> None:
         self.network = getattr(owner, "network", owner)
         self.module = copy.deepcopy(self.network.module()).double()
         log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
@@ -77,7 +78,7 @@ class Twin:
         return torch.distributions.Categorical(logits=outputs)
 
 
-def laid_out(network: Network | MetaNetworks, arrays: list[np.ndarray]) -> np.ndarray:
+def laid_out(network: Network | CompiledMetaNetwork, arrays: list[np.ndarray]) -> np.ndarray:
     """Arrays like its module's parameters as one vector like the network's.
 
     A compiled network has its columns filled up to a multiple of 16 with zeros. What follows the
@@ -102,6 +103,14 @@ def laid_out(network: Network | MetaNetworks, arrays: list[np.ndarray]) -> np.nd
 def beta_of(twin: Twin, sequence: np.ndarray) -> torch.Tensor:
     """The logistic function of the reference network's answer to what an episode was, [1]."""
     return torch.sigmoid(twin(sequence))
+
+
+def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:
+    """The policy for rollouts, as its learner gives it."""
+    normalisation = Normalisation.of(mean, std, clip)
+    if isinstance(policy.network, CompiledMLP):
+        return CompiledActing.of(policy.network, policy.log_std, normalisation)
+    return NetworkActing(policy, normalisation)
 
 
 def layer_norm(inputs: int, outputs: int, hidden_units: list[int]) -> torch.nn.Module:
@@ -133,8 +142,8 @@ class Killed(BaseException):
 
 
 def files(directory: Path) -> list[str]:
-    """Those of a run but for its lock, which stays."""
-    return sorted({path.name for path in directory.iterdir()} - {LOCK})
+    """Those of a run but for its lock, which stays, and for what was set aside."""
+    return sorted({path.name for path in directory.iterdir() if path.is_file()} - {LOCK})
 
 
 def provenance_of(directory: Path) -> dict:

@@ -98,7 +98,7 @@ def test_scales_of_several_episodes(make_ppo, kind, smallest, least, unit):
     Tiny extrinsic rewards are not blown up: they are over at least 1, their advantages over 0.1.
     """
     ppo, paid, seen = make_ppo(intrinsic=True, discount=0.0), [], []
-    ppo.critics[kind].network.parameters[:] = 0
+    ppo.critics[kind].parameters[:] = 0
     for rewards in unit * np.array([[4.0, -4.0], [0.0, 0.0], [8.0, -8.0]]):
         paid += rewards.tolist()
         expected = rewards / max(np.std(paid), smallest)
@@ -132,7 +132,7 @@ def test_units_do_not_matter(run_config, register, monkeypatch, reward, bonus):
         trainer = finish(run_config(name, "mace_fixed", episodes=40, ppo=ppo, novelty=novelty))
         assert len(trainer.curiosity.novelty.visited) > 20  # all of novelty was at work
         assert sum(record.extrinsic_return for record in trainer.records) > 40 * reward
-        return {name: adam.parameters.tobytes() for name, adam in trainer.ppo.optimisers.items()}
+        return {name: own.tobytes() for name, own in trainer.ppo.learner.parameters.items()}
 
     for scaled in (True, False):
         same = learned(64.0, 1.0, scaled) == learned(reward, bonus, scaled)

@@ -267,11 +267,11 @@ def test_beta_follows_what_helped_and_comes_back_when_nothing_is_left_to_learn(m
 
 def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(make):
     gradient, found = np.array([1.0, 0.0], np.float32), []
-    for influence in (0.5, 1.0, 3.0):
+    for advantage_rms in (0.5, 1.0, 3.0):
         controller, rng, credit = make(horizon=1), np.random.default_rng(0), None
         while credit is None:
             controller.next_episode(episode_of(rng), rng.random(20))
-            credit = controller.learn(gradient, 1.0, [Effect(gradient, influence)])
+            credit = controller.learn(gradient, 1.0, [Effect(gradient, advantage_rms)])
         found.append(credit)
     # The gradient goes the effect's way, always as far: in its usual size, by 1.
     assert found == pytest.approx([0.5, 1.0, 1.0])

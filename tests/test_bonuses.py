@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from shared import ENGINES, Twin, finish
+from shared import Twin, finish
 from torch.nn.functional import cross_entropy
 
 from mace_rl.bonus.hashing import HashCounts
@@ -18,7 +18,7 @@ from mace_rl.bonus.rnd import RandomNetworkDistillation
 from mace_rl.config.bonus import HashCountsBonus, ICMBonus, RNDBonus
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.rollout import Episode
-from mace_rl.finite import NonFiniteError
+from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
 from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
@@ -36,23 +36,22 @@ def wander(seed, centre=0.0, scale=1.0, length=50, size=SIZE, actions="discrete"
     return Episode(states.astype(np.float32), taken, zeros.astype(np.float32), zeros, False)
 
 
-def make(kind: str, seed=0, engine="compiled", actions="discrete", **settings) -> IntrinsicReward:
+def make(kind: str, seed=0, actions="discrete", **settings) -> IntrinsicReward:
     space, generator = Box(-9, 9, (SIZE,)), np.random.default_rng(seed)
     if kind == "icm":
         config = ICMBonus(kind=kind, **settings)
-        return IntrinsicCuriosityModule(config, engine, space, ACTIONS[actions], SIZE, generator)
+        return IntrinsicCuriosityModule(config, space, ACTIONS[actions], SIZE, generator)
     if kind == "rnd":
         config = RNDBonus(kind=kind, **settings)
-        return RandomNetworkDistillation(config, engine, space, SIZE, generator)
+        return RandomNetworkDistillation(config, space, SIZE, generator)
     return HashCounts(HashCountsBonus(kind=kind, **settings), space, SIZE, generator)
 
 
 # --- RND ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_rnd_falls_where_it_was_and_stays_high_elsewhere(engine):
-    rnd, near, far = make("rnd", engine=engine), wander(99), wander(98, centre=4.0)
+def test_rnd_falls_where_it_was_and_stays_high_elsewhere():
+    rnd, near, far = make("rnd"), wander(99), wander(98, centre=4.0)
     target = rnd.target.parameters.copy()
     means = []
     for seed in range(150):
@@ -78,10 +77,9 @@ def test_an_episode_is_learned_once_in_minibatches_in_random_order(kind, monkeyp
     np.testing.assert_array_equal(np.concatenate(parts), bonus.inputs(episode)[order])
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_rnd_by_autograd(engine):
+def test_rnd_by_autograd():
     """The bonus and the gradient, from the two networks as torch modules in float64."""
-    rnd = make("rnd", engine=engine)
+    rnd = make("rnd")
     known, episode = wander(0, scale=[1, 2, 3, 4, 50]), wander(7, scale=20.0)
     rnd.remember(known, np.zeros(50))
     states = known.observations[1:]
@@ -97,10 +95,9 @@ def test_rnd_by_autograd(engine):
 
 
 @pytest.mark.parametrize("actions", ACTIONS)
-@pytest.mark.parametrize("engine", ENGINES)
-def test_icm_by_autograd(engine, actions):
+def test_icm_by_autograd(actions):
     """Its joint loss (equation 7) written out from its three networks, in float64."""
-    icm = make("icm", engine=engine, actions=actions, forward_weight=0.3, scale=4.0)
+    icm = make("icm", actions=actions, forward_weight=0.3, scale=4.0)
     episode = wander(1, actions=actions)
     features, inverse_model, forward_model = twins = [
         Twin(network) for network in (icm.features, icm.inverse_model, icm.forward_model)
@@ -162,10 +159,9 @@ def test_discrete_states_are_counted_one_by_one(run_config):
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-def test_training(run_config, environment, engine, kind):
-    changes = {"bonus": {"kind": kind}, "episodes": 4, "engine": engine, "max_episode_steps": 60}
+def test_training(run_config, environment, kind):
+    changes = {"bonus": {"kind": kind}, "episodes": 4, "max_episode_steps": 60}
     config = run_config(environment, "mace_fixed", 3, **changes)
     assert config.memory is config.novelty is None
     trainer = finish(config)
@@ -188,7 +184,7 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, environment, bonus):
     changes |= {"beta": {"kind": "constant", "value": 0}, "bonus": bonus}
     zero = finish(run_config(environment, "mace_fixed", 3, **changes))
     for name in ("actor", "extrinsic"):
-        states = [archive(run.ppo.optimisers[name].state_dict()) for run in (zero, plain)]
+        states = [archive(run.ppo.learner.optimisers[name].state_dict()) for run in (zero, plain)]
         assert states[0] == states[1]
     returns = [[record.extrinsic_return for record in run.records] for run in (zero, plain)]
     assert returns[0] == returns[1] and plain.curiosity is None

@@ -1,8 +1,6 @@
 """The verdicts of the protocol's rule, from tables in which the truth is known."""
 
 import itertools
-from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -22,7 +20,7 @@ from invented import (
 from mace_rl.runs.records import RecordError
 from mace_rl.study.claims_config import CORRELATION
 from mace_rl.study.compare import verdicts
-from mace_rl.study.compare.ledger import Answer, Finding, read_ledger, to_json
+from mace_rl.study.compare.ledger import Finding
 from mace_rl.study.config import Study, read_study
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
@@ -124,9 +122,7 @@ def test_all_parts_are_corrected_together_and_have_the_margin_of_what_they_measu
             for part in parts:
                 assert getattr(part, corrected) == pytest.approx(expected[getattr(part, given)])
         assert len({round(part.p_holm, 9) for part in parts}) > 5  # they are not all 1
-        margins = {
-            (part.metric, *part.environments): part.worth_mentioning for part in parts
-        }
+        margins = {(part.metric, *part.environments): part.worth_mentioning for part in parts}
         for environment in EPISODES:
             assert margins[CORRELATION, environment] == 0.05
             reference = study.metrics.reference_return[environment]

@@ -1,7 +1,11 @@
 """The command `mace-rl`: mistakes are answered in one line before anything is done."""
 
 import json
+import os
+import pty
 import shlex
+import subprocess
+import sys
 
 import pytest
 import yaml
@@ -160,7 +164,7 @@ def test_a_run_by_hand_then_again_then_as_another_then_damaged(monkeypatch, tmp_
     assert files(out) == RESULTS
     whole = {path.name: path.read_bytes() for path in out.iterdir()}
     caplog.clear()
-    named = [str(out), "choose another folder, or remove this one"]
+    named = [str(out), "choose another folder, or set this run aside: --restart"]
     for option, value, difference in (
         ("--seed", "1", "config.seed was 0 and is 1"),
         ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),
@@ -228,3 +232,56 @@ def test_an_interrupted_training_says_that_it_resumes(monkeypatch, caplog):
     monkeypatch.setattr(cli, "train", interrupted)
     assert call(monkeypatch, "train", "--out", "x", *sum(GOOD.items(), ())) == (130, "")
     assert caplog.messages == ["interrupted; the same command resumes it"]
+
+
+LOUD = """
+import gymnasium
+from shared import Bonanza
+class Loud(Bonanza):
+    def step(self, action):
+        print("β" * 9999)  # in letters that the terminal may lack, and at once
+        return super().step(action)
+gymnasium.register("Loud-v0", Loud, max_episode_steps=5)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "shown", [">&-", "2>&-", "<&- >&- 2>&-", "2>&1 | true", ">/dev/full 2>&1", "a lost terminal"]
+)
+def test_nobody_has_to_watch_a_training(tmp_path, shown):
+    (tmp_path / "loud.py").write_text(LOUD, encoding="utf-8")
+    options = "--env loud:Loud-v0 --variant ppo --episodes 9 --out run"
+    command = f"set -o pipefail; {shlex.quote(sys.executable)} -m mace_rl train {options}"
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = os.environ | {"PYTHONPATH": paths, "PYTHONIOENCODING": "ascii"}
+    if shown == "a lost terminal":
+        command, shown = f"trap '' HUP; sleep 0.5; {command}", ""
+        terminal, end = pty.openpty()
+    else:
+        terminal = end = os.open(os.devnull, os.O_RDWR)
+    with subprocess.Popen(
+        ["bash", "-c", f"{command} {shown}"],
+        cwd=tmp_path,
+        env=environment,
+        start_new_session=True,
+        **dict.fromkeys(("stdin", "stdout", "stderr"), end),
+    ) as process:
+        os.close(terminal)
+    assert (process.returncode, files(tmp_path / "run")) == (0, sorted(RESULTS))
+
+
+@pytest.mark.parametrize("command", [["status", "."], ["train", *sum(GOOD.items(), ())]])
+def test_what_leaves_by_itself_has_not_succeeded(monkeypatch, command):
+    """A module of the user's that calls `sys.exit(0)` when it is imported."""
+    monkeypatch.setattr(cli, command[0], lambda _: sys.exit(0))
+    code, said = call(monkeypatch, *command)
+    assert code == 1 and said.endswith("ended the program: SystemExit(0)")
+
+
+def test_code_that_cannot_run_uncompiled_says_so(tmp_path):
+    command = [sys.executable, "-m", "mace_rl", "train", *sum(GOOD.items(), ()), "--out", "x"]
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("mace-rl: NUMBA_DISABLE_JIT is set")

@@ -9,13 +9,14 @@ import torch
 from gymnasium.spaces import Discrete
 from shared import Twin, beta_of, finish
 
-from mace_rl.agent.adam import Adam
-from mace_rl.agent.network import CompiledMLP, mlp
+from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import PPO
+from mace_rl.config.agent import PPOConfig
 from mace_rl.config.run import RunConfig
 from mace_rl.experience import Experience
 from mace_rl.factories import beta_controller
+from mace_rl.numerics.adam import Adam
+from mace_rl.numerics.network import CompiledMLP, mlp
 from mace_rl.streams import Streams
 from mace_rl.trainer import Trainer
 
@@ -29,9 +30,10 @@ class SmallProblem:
     float32 makes of them.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, config: PPOConfig, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.actor = Policy(CompiledMLP(mlp([3, 5, 2], 1.0, rng)), Discrete(2), 0.0)
+        self.learner = CompiledLearner(config, self.actor, {})
         own = Twin(self.actor).own()
         self.parameters = 0.7 * rng.standard_normal(len(own)) * own
         # Reward of each action in each state, for the two kinds.
@@ -44,23 +46,21 @@ class SmallProblem:
         return np.exp(logits) / np.exp(logits).sum(1, keepdims=True) * rewards
 
     def gradient(self, rewards: np.ndarray) -> np.ndarray:
-        """∇J through `PPO.policy_gradients`: every case, weighted with its probability."""
-        ppo = PPO.__new__(PPO)
-        ppo.policy = self.actor
+        """∇J through `policy_gradients`: every case, weighted with its probability."""
         self.actor.parameters[:] = self.parameters
         states, actions = np.eye(3).repeat(2, axis=0), np.array([0, 1] * 3)
-        (mean,) = ppo.policy_gradients(states, actions, [self.returns(rewards).ravel()])
+        (mean,) = self.learner.policy_gradients(states, actions, [self.returns(rewards).ravel()])
         return 6 * mean
 
 
 @pytest.mark.parametrize("beta", [0.1, 0.9])
 @pytest.mark.parametrize("seed", range(3))
-def test_credit_is_the_derivative_of_the_next_policy_s_return(seed, beta):
+def test_credit_is_the_derivative_of_the_next_policy_s_return(run_config, seed, beta):
     """dJ_E(θ') / dβ = η ⟨g_E(θ'), P g_I(θ)⟩ for θ' one Adam step along g_E + β g_I from θ.
 
     β is moved by hand on the left, through Adam as it is, whose moments have a history.
     """
-    problem, rng = SmallProblem(seed), np.random.default_rng(seed)
+    problem, rng = SmallProblem(run_config().ppo, seed), np.random.default_rng(seed)
     start = problem.parameters.copy()
     extrinsic = problem.gradient(problem.extrinsic)
     intrinsic = problem.gradient(problem.intrinsic)
@@ -100,14 +100,14 @@ class Watched(Trainer):
         self.rounds: list[Round] = []
 
     def adapt(self, rollout: list[Experience]) -> float | None:
-        meta, adam, learned = Twin(self.controller.network), self.ppo.optimisers["actor"], []
-        policy, square, step = adam.parameters.copy(), adam.square.copy(), Adam.step
-        decayed = float(adam.decayed[1])
+        meta, learner, learned = Twin(self.controller.network), self.ppo.learner, []
+        policy, step = learner.parameters["actor"].copy(), Adam.step
+        unit = 1 / learner.preconditioned(np.ones(len(policy), np.float32))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Adam, "step", lambda s, g: (learned.append(g.copy()), step(s, g))[1])
             credit = super().adapt(rollout)
-        directions = [judged.direction.copy() for judged in self.controller.judged[-len(rollout) :]]
-        self.rounds.append(Round(rollout, policy, square, decayed, meta, directions, learned))
+        directions = [item.direction.copy() for item in self.controller.pending[-len(rollout) :]]
+        self.rounds.append(Round(rollout, policy, unit, meta, directions, learned))
         return credit
 
 
@@ -116,8 +116,7 @@ class Round(NamedTuple):
 
     rollout: list[Experience]
     policy: np.ndarray  # the parameters that played it
-    square: np.ndarray  # of the actor's optimiser before the update
-    decayed: float  # 0.999 to the power of its steps so far
+    unit: np.ndarray  # √v̂ + ε of the actor's optimiser before the update; test_ppo.py has it
     meta: Twin  # as it was while it was played
     directions: list[np.ndarray]  # for each of its episodes the change of the update by its β
     learned: list[np.ndarray]  # the gradient, if any, that reached the meta network after it
@@ -212,11 +211,8 @@ def test_direction_is_how_the_update_moves_with_beta(watched):
         return policy_gradient(watched, each, total / np.sqrt(np.mean(total**2)))
 
     for each in watched.rounds:
-        steps = 1.0
-        if each.decayed < 1:
-            steps = np.sqrt(each.square / (1 - each.decayed)) + 1e-5
         for number, found in enumerate(each.directions):
-            change = (update(each, number, 1e-4) - update(each, number, -1e-4)) / 2e-4 / steps
+            change = (update(each, number, 1e-4) - update(each, number, -1e-4)) / 2e-4 / each.unit
             expected = change / np.linalg.norm(change)
             largest = np.abs(expected).max()
             np.testing.assert_allclose(found, expected, rtol=1e-2, atol=2e-3 * largest)
@@ -250,9 +246,9 @@ def test_each_beta_is_credited_with_its_own_effect(watched):
             weight = 0.99 * weight + 1
         for earlier, place, along in judged:
             item = watched.rounds[earlier].rollout[place]
-            influence = min(1, np.sqrt(np.mean(scaled(item, "intrinsic") ** 2)))
+            strength_of_bonus = min(1, np.sqrt(np.mean(scaled(item, "intrinsic") ** 2)))
             usual = np.sqrt(squares / weight)
-            credits[earlier][place] += along / usual * min(1, strength) * influence
+            credits[earlier][place] += along / usual * min(1, strength) * strength_of_bonus
         credits.append(np.zeros(len(each.rollout)))
         told = watched.diagnostics[number].beta_credit
         if number >= 2:

@@ -7,14 +7,14 @@ import pytest
 import torch
 from shared import Twin
 
-from mace_rl.agent.adam import Adam
 from mace_rl.bonus.density import DensityEstimator
+from mace_rl.numerics.adam import Adam
 
 
 def made(size, hidden_units) -> DensityEstimator:
     """An estimator with arbitrary weights."""
     generator = np.random.default_rng(0)
-    model = DensityEstimator(size, hidden_units, "compiled", generator)
+    model = DensityEstimator(size, hidden_units, generator)
     parameters = model.network.parameters
     parameters[:] = 0.5 * generator.standard_normal(len(parameters)) * free(model)
     return model
@@ -60,15 +60,14 @@ def test_log_density_and_gradient_equal_autograd(size, narrow):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * largest)
 
 
-@pytest.mark.parametrize("engine", ["compiled", "torch"])
-def test_training_approaches_the_entropy_of_a_known_gaussian(engine):
+def test_training_approaches_the_entropy_of_a_known_gaussian():
     """Held-out log-likelihood rises to minus the entropy, and not above it."""
     rng = np.random.default_rng(0)
     factor = np.array([[1.0, 0, 0], [0.8, 0.6, 0], [-0.5, 0.5, 0.3]])
     data = (rng.standard_normal((12_000, 3)) @ factor.T + [1, -1, 0]).astype(np.float32)
     entropy = 1.5 * math.log(2 * math.pi * math.e) + math.log(0.6 * 0.3)
     train, held_out = data[:10_000], data[10_000:]
-    model = DensityEstimator(3, 64, engine, rng)
+    model = DensityEstimator(3, 64, rng)
     adam = Adam(model.network.parameters, 0.005)
     likelihoods = []
     for step in range(1201):

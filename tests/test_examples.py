@@ -74,7 +74,7 @@ def test_what_the_page_shows_works(tmp_path, monkeypatch):
     for block in blocks:
         exec(block, names)
         env = names["env"]
-        assert len(env.appraisal.curiosity.memory) > 0  # the restored one's, too
+        assert len(env.tracker.curiosity.memory) > 0  # the restored one's, too
     names["shared"].reset()
     assert names["shared"].step(np.arange(4))[1].shape == (4,)
     names["agent"].learn(1)

@@ -30,6 +30,24 @@ def test_the_table_has_every_episode_of_every_run(runs, monkeypatch, tmp_path):
             assert own[name].tolist() == records[names.get(name, name)].tolist()
 
 
+def test_runs_behind_links_are_there_and_once(runs, monkeypatch, tmp_path, capsys, caplog):
+    """For every command that looks for runs; what was set aside is not."""
+    caplog.set_level("INFO")
+    elsewhere = (runs / "ppo").rename(tmp_path / "elsewhere")
+    (runs / "ppo").symlink_to(elsewhere)
+    (runs / "mace_full" / "loop").symlink_to(runs)
+    (runs / "mace_full" / "again").symlink_to(runs / "mace_full" / "seed1")
+    shutil.copytree(elsewhere / "seed0", elsewhere / "seed0" / "_aside1")
+    out = tmp_path / "runs.csv"
+    for _ in range(2):  # over what it wrote itself
+        assert call(monkeypatch, "export", str(runs), "--out", str(out)) == (0, "")
+    assert len(pd.read_csv(out)) == 12
+    assert call(monkeypatch, "tensorboard", str(runs), "--out", str(tmp_path / "e")) == (0, "")
+    assert "runs: 2;" in caplog.text
+    assert call(monkeypatch, "verify", str(runs)) == (0, "")
+    assert "2 of 2 runs equal" in capsys.readouterr().out
+
+
 def test_the_page_s_interquartile_mean(trained, monkeypatch, tmp_path, capsys):
     """Of the last tenth of 10 episodes, the last one, over 4 seeds: the mean of the middle two."""
     for seed in range(4):
@@ -50,6 +68,13 @@ def test_mistakes_get_one_line(runs, monkeypatch, tmp_path):
         assert code == 1 and "\n" not in said and not (tmp_path / out).exists()
         return said
 
+    mine = tmp_path / "mine.csv"
+    mine.write_text("x,y\n1,2\n")
+    assert (
+        "and not written by this command"
+        in call(monkeypatch, "export", str(runs), "--out", str(mine))[1]
+    )
+    assert mine.read_text() == "x,y\n1,2\n"
     assert "--out is " in refused("x.json") and "end in .csv or .parquet" in refused("x.json")
     assert "pip install pyarrow" in refused("x.parquet")  # the lock is without; make test-wheel has
     (tmp_path / "empty").mkdir()

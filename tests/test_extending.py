@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from shared import call
 
+from mace_rl.library import settings
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.records import read_episodes
 from mace_rl.study.config import read_study
@@ -56,7 +57,7 @@ def replace(file: Path, old: str, new: str) -> None:
 def test_every_example_is_one_file_and_one_entry():
     assert {Path(name).suffix for name in FILES} == {".py", ".yaml"}
     assert all(f"{Path(name).stem}.yaml" in FILES for name in FILES)
-    assert set(TRAININGS) == {"layer_norm", "grid_counts", "linear_decay", "chain"}
+    assert set(TRAININGS) == {"layer_norm", "grid_counts", "linear_decay", "chain", "growing_chain"}
 
 
 @pytest.mark.parametrize("name", TRAININGS)
@@ -77,6 +78,15 @@ def test_example_trains(folder, train, name):
             np.testing.assert_allclose(episodes["beta"], expected)
         case "chain":
             assert (episodes["length"] <= 50).all() and episodes["extrinsic_return"].max() == 1
+        case "growing_chain":  # from a place 2 of 4, one step is enough the first time only
+            assert episodes["extrinsic_return"].sum() >= 2
+
+
+def test_the_example_s_state_is_saved(folder, kill, checkpoint_every, completes):
+    config = settings("growing_chain:GrowingChain-v0", "ppo", config="growing_chain.yaml")
+    checkpoint_every(1)
+    kill(15, config, folder / "killed")
+    assert completes(config, folder / "killed")["interruptions"][0]["environment_replayed"]
 
 
 def test_edit_of_the_user_s_file_makes_it_another_run(folder, train):
@@ -93,14 +103,14 @@ def test_edit_of_the_user_s_file_makes_it_another_run(folder, train):
 
 
 def test_example_metric(folder):
-    settings = read_study([ROOT / "config.yaml", folder / "to_100.yaml"]).metrics
-    *_, metric = all_metrics(settings)
+    metrics = read_study([ROOT / "config.yaml", folder / "to_100.yaml"]).metrics
+    *_, metric = all_metrics(metrics)
     assert (metric.name, metric.label) == ("to_100", "Episodes to 100")
     for returns, expected in (
         ([0.0] * 20 + [150.0] * 20, (27, False)),  # 7 of the last 10 are 150: 105
         ([99.0] * 40, (40, True)),
     ):
-        curve = LearningCurve(np.array(returns), 0.0, 0.0, settings)
+        curve = LearningCurve(np.array(returns), 0.0, 0.0, metrics)
         assert metric.function(curve) == expected
 
 

@@ -54,7 +54,7 @@ def data(shown=RETURN, runs=None, **shape):
 
 def draw(colours=COLOURS, shown=RETURN, runs=None, inset=None, **shape):
     layout = FigureConfig(columns=3, inset=inset)
-    look = PlotStyle(layout, 0.95, LABELS, colours)
+    look = PlotStyle(layout, 0.95, LABELS, colours, {})
     return draw_figure(*data(shown, runs, **shape), shown, look)
 
 

@@ -101,6 +101,10 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
     with pytest.raises(ValueError, match=r"ppo\.tar\.xz has another run of this seed"):
         kept_runs.pack(tmp_path / "results", kept)
     assert content(kept) == before
+    others = content(tmp_path / "results")
+    with pytest.raises(ValueError, match=r"seed100/.* there already, and not the kept one"):
+        kept_runs.unpack(kept, tmp_path / "results")
+    assert content(tmp_path / "results") == others
 
 
 @pytest.mark.parametrize("command", ["pack", "unpack"])

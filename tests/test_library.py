@@ -1,23 +1,28 @@
 """The five names of `mace_rl`, in somebody's own program."""
 
+import datetime
 import json
+import math
 import os
 import re
 import subprocess
 import sys
+import tempfile
 from importlib.metadata import requires, version
 from pathlib import Path
 
 import gymnasium
+import numba
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from shared import call
 
 import mace_rl
-from mace_rl import load_agent, settings, train
+from mace_rl import compiling, load_agent, settings, train
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
+from mace_rl.refusal import Refusal
 from mace_rl.runs.records import read_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -73,12 +78,36 @@ def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
 
 
+OWN = {"kind": "custom", "arguments": {"d": {1}}}
+
+
+def given(value: object) -> dict:
+    """An argument of the environment."""
+    return {"environment_arguments": {"d": value}}
+
+
 MISTAKES = {
     "unknown key 'ppo.clpi'": {"ppo": {"clpi": 0.1}},
     "unknown key 'epsiodes' (value 3); the nearest known key is 'episodes'": {"epsiodes": 3},
     "episodes is 0, but should be greater than 0": {"episodes": 0},
     "variant has 'mace_ful'": {"variant": "mace_ful"},
     "seed is 1.5": {"seed": 1.5},
+    "environment_arguments.d is datetime.date(2024, 1, 1), but it should be made of": given(
+        datetime.date(2024, 1, 1)
+    ),
+    "environment_arguments.d is [{1}], but": given([{1}]),
+    "environment_arguments.d is {1: 2}, but": given({1: 2}),
+    "environment_arguments.d is nan, but it should be made of finite": given(math.nan),
+    "environment_arguments.d is array(": given(np.zeros(2)),
+    "environment_arguments.d is <built-in function len>": given(len),
+    "environment_arguments.d is b'x'": given(b"x"),
+    "surrogates not allowed": given("\ud800"),
+    "beta.arguments.d is {1}": {"beta": OWN | {"rule": "a:B"}},
+    "bonus.arguments.d is {1}": {"bonus": OWN | {"estimator": "a:B"}},
+    "novelty.arguments.d is {1}": {"novelty": OWN | {"estimator": "a:B"}},
+    "ppo.network.arguments.d is {1}": {
+        "ppo": {"network": OWN | {"kind": "torch", "module": "a:B"}}
+    },
     "--max-episode-steps": {"environment": "Blackjack-v1"},
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
 }
@@ -89,6 +118,22 @@ def test_a_mistake_gets_one_line(message):
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
         settings(**{"environment": "CartPole-v1"} | MISTAKES[message])
     assert "\n" not in str(caught.value)
+
+
+def test_arguments_are_what_json_gives_back(monkeypatch, tmp_path):
+    """So that what is played later is what was trained, and the same call finds its run again."""
+    given = {"map_name": None, "desc": (np.str_("SF"), "FG"), "is_slippery": np.bool_(False)}
+    run = settings("FrozenLake-v1", "ppo", episodes=2, environment_arguments=given)
+    plain = {"map_name": None, "desc": ["SF", "FG"], "is_slippery": False}
+    assert run.environment_arguments == plain
+    assert [*map(type, run.environment_arguments.values())] == [type(None), list, bool]
+    for _ in range(2):
+        train(run, folder=tmp_path)
+    found = json.loads((tmp_path / "run.json").read_text())["config"]
+    assert found["environment_arguments"] == plain
+    other = settings("FrozenLake-v1", "ppo", episodes=3, environment_arguments=given)
+    assert len(train(other, folder=tmp_path, restart=True).episodes) == 3
+    assert json.loads((tmp_path / "_aside1" / "run.json").read_text())["config"] == found
 
 
 def test_train_is_the_command_and_calls_back_for_each_episode(monkeypatch, tmp_path):
@@ -136,3 +181,27 @@ def test_the_readme_s_example(monkeypatch, tmp_path):
     names: dict = {}
     exec(example.replace("episodes=200", "episodes=4"), names)
     assert len(names["episodes"]) == 4
+
+
+def test_without_a_folder_for_caches_a_temporary_one_serves(tmp_path, monkeypatch, caplog):
+    """numba runs what it finds there."""
+    folders = []
+
+    def njit(**options):
+        folders.append(compiling.config.CACHE_DIR)
+        if len(folders) == 1:
+            raise RuntimeError("cannot cache function 'f': no locator available for file 'f.py'")
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", njit)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    compiling.spare_folder.cache_clear()
+    before = compiling.config.CACHE_DIR
+    assert compiling.njit(cache=True)(abs) is abs
+    (own,) = tmp_path.iterdir()
+    assert folders[1] == str(own / compiling.FOLDER.name) and before == compiling.config.CACHE_DIR
+    assert len(caplog.messages) == 1 and str(own) in caplog.text
+    own.chmod(0o770)
+    compiling.spare_folder.cache_clear()
+    with pytest.raises(Refusal, match="is not this user's alone: let NUMBA_CACHE_DIR name"):
+        compiling.spare_folder()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mace_rl.nearest import Neighbours
+from mace_rl.numerics.nearest import Neighbours
 
 
 @settings(deadline=None, max_examples=80)

@@ -1,4 +1,4 @@
-"""The networks: both engines against autograd, the LSTM against PyTorch's, any torch module."""
+"""The networks: compiled ones against autograd, the LSTM against PyTorch's, any torch module."""
 
 import copy
 import math
@@ -8,21 +8,21 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 import torch
-from shared import LAYER_NORM, laid_out, layer_norm
+from shared import LAYER_NORM, laid_out
 
-from mace_rl.agent import kernels
-from mace_rl.agent.network import CompiledMLP, TorchNetwork, mlp, network
-from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork, TorchMetaNetwork, meta_network
-from mace_rl.bonus.density import CompiledAutoencoder, DensityEstimator, MaskedAutoencoder
+from mace_rl.agent.custom import custom_module
+from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork
+from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
+from mace_rl.numerics.arrays import shuffled
+from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 
-# --- Both engines -------------------------------------------------------------------------------
+# --- Compiled networks --------------------------------------------------------------------------
 
 # Compiled form, torch module from a generator, shape of the inputs or shapes of several sequences.
 CASES = []
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
     CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
-CASES.append((TorchNetwork, lambda rng: layer_norm(6, 3, [16]), (20, 6)))
 for size in (1, 2, 15):
     CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
 for units, lengths in product((1, 5, 128), ([1], [300], [7, 32, 1, 32, 7])):
@@ -38,7 +38,7 @@ def drawn(rng: np.random.Generator, shape) -> np.ndarray | list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("compiled", "make", "shape"), CASES)
-def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
+def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, shape):
     """Outputs and gradients with arbitrary weights, biases included, to float32's rounding."""
     rng = np.random.default_rng(0)
     module = make(rng)
@@ -47,7 +47,7 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
             free = (part != 0) | (part.ndim == 1)  # masked weights stay 0
             part += 0.3 * free * torch.from_numpy(rng.standard_normal(part.shape)).float()
     several = isinstance(shape, list)
-    inputs, general = drawn(rng, shape), TorchMetaNetwork if several else TorchNetwork
+    inputs = drawn(rng, shape)
 
     def answers(module: torch.nn.Module) -> torch.Tensor:
         kind = next(module.parameters()).dtype
@@ -59,32 +59,31 @@ def test_both_engines_equal_autograd_in_double_precision(compiled, make, shape):
     grad_outputs = rng.standard_normal(expected.shape)
     loss = (expected * torch.from_numpy(grad_outputs)).sum()
     gradients = [g.numpy() for g in torch.autograd.grad(loss, double.parameters())]
-    for one in (compiled(copy.deepcopy(module)), general(module)):
-        trace = one.forward(inputs)
-        np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
-        one.backward(trace, np.ones_like(trace.outputs))  # β's credit goes back more than once
-        found = one.backward(trace, grad_outputs.astype(np.float32))
-        flat = laid_out(one, gradients)
-        tolerance = 1e-4 * np.abs(flat).max()
-        np.testing.assert_allclose(found, flat, rtol=1e-3, atol=tolerance)
-        assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
-        added = laid_out(one, [np.ones_like(part) for part in gradients]) == 0
-        assert (found[added] == 0).all() and (one.parameters[added] == 0).all()
-        if not several:
-            seen = torch.from_numpy(inputs).double().requires_grad_()
-            (double(seen) * torch.from_numpy(grad_outputs)).sum().backward()
-            again, inward = one.gradients(trace, grad_outputs.astype(np.float32))
-            np.testing.assert_array_equal(again, found)
-            tolerance = 1e-4 * seen.grad.abs().max().item()
-            np.testing.assert_allclose(inward, seen.grad, rtol=1e-3, atol=tolerance)
-            assert inward.dtype == np.float32
-        assert found.shape == one.parameters.shape == flat.shape
-        other = type(one)(make(np.random.default_rng(1)))
-        held = other.parameters
-        other.load_module_state(copy.deepcopy(one.module().state_dict()))
-        assert (other.parameters == one.parameters).all() and other.parameters is held
-        again = answers(copy.deepcopy(one.module())).detach()
-        np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
+    one = compiled(copy.deepcopy(module))
+    trace = one.forward(inputs)
+    np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
+    one.backward(trace, np.ones_like(trace.outputs))  # β's credit goes back more than once
+    found = one.backward(trace, grad_outputs.astype(np.float32))
+    flat = laid_out(one, gradients)
+    np.testing.assert_allclose(found, flat, rtol=1e-3, atol=1e-4 * np.abs(flat).max())
+    assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
+    added = laid_out(one, [np.ones_like(part) for part in gradients]) == 0
+    assert (found[added] == 0).all() and (one.parameters[added] == 0).all()
+    if compiled is CompiledMLP:
+        seen = torch.from_numpy(inputs).double().requires_grad_()
+        (double(seen) * torch.from_numpy(grad_outputs)).sum().backward()
+        again, inward = one.gradients(trace, grad_outputs.astype(np.float32))
+        np.testing.assert_array_equal(again, found)
+        tolerance = 1e-4 * seen.grad.abs().max().item()
+        np.testing.assert_allclose(inward, seen.grad, rtol=1e-3, atol=tolerance)
+        assert inward.dtype == np.float32
+    assert found.shape == one.parameters.shape == flat.shape
+    other = compiled(make(np.random.default_rng(1)))
+    held = other.parameters
+    other.load_module_state(copy.deepcopy(one.module().state_dict()))
+    assert (other.parameters == one.parameters).all() and other.parameters is held
+    again = answers(copy.deepcopy(one.module())).detach()
+    np.testing.assert_allclose(again, expected.detach(), rtol=1e-4, atol=2e-5)
 
 
 def test_parameters_in_another_precision_are_refused():
@@ -92,20 +91,6 @@ def test_parameters_in_another_precision_are_refused():
     compiled = CompiledMLP(mlp([3, 5, 2], 1.0, np.random.default_rng(0)))
     with pytest.raises(ValueError, match="float32, not float64"):
         compiled.move_to(np.zeros(len(compiled.parameters)))
-
-
-def test_both_engines_start_alike(run_config):
-    inputs = np.random.default_rng(1).standard_normal((9, 6)).astype(np.float32)
-
-    def outputs(engine: str) -> list[np.ndarray]:
-        density = DensityEstimator(6, 8, engine, np.random.default_rng(3))
-        policy = network(run_config().ppo, engine, 6, 2, 0.5, np.random.default_rng(3))
-        meta = meta_network(6, 5, 0.3, engine, np.random.default_rng(3))
-        answers = policy.forward(inputs).outputs, meta.forward([inputs, inputs[:3]]).outputs
-        return [*answers, density.log_prob(inputs), density.gradient(inputs).sum()]
-
-    for one, other in zip(outputs("compiled"), outputs("torch"), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("hidden", [[1], [5, 17], [64, 64]])
@@ -178,10 +163,10 @@ def test_a_permutation_is_uniform_if_the_draws_are():
     """Draws from the middles of equal parts of [0, 1), so that each choice is equally often."""
     middles = (np.arange(12) + 0.5) / 12
     draws = np.stack(np.meshgrid([0.3], middles, middles, middles), axis=-1).reshape(-1, 4)
-    found, counts = np.unique(kernels.shuffled(draws), axis=0, return_counts=True)
+    found, counts = np.unique(shuffled(draws), axis=0, return_counts=True)
     assert found.tolist() == sorted(map(list, permutations(range(4))))
     assert (counts == 12**3 / 24).all()
-    assert (kernels.shuffled(np.ones((2, 5))) == np.arange(5)).all()
+    assert (shuffled(np.ones((2, 5))) == np.arange(5)).all()
 
 
 # --- Any torch module ---------------------------------------------------------------------------
@@ -218,15 +203,19 @@ def test_modules_that_do_not_fit_are_refused_by_name(run_config, module, argumen
     own = LAYER_NORM | {"module": f"test_network:{module}", "arguments": arguments}
     config = run_config(ppo={"network": own}).ppo
     with pytest.raises(ConfigError, match=rf"ppo\.network\.module.*{module}.*{problem}"):
-        network(config, "compiled", 40, 3, 1.0, np.random.default_rng(0))
+        custom_module(config.network, config.hidden_units, 40, 3, np.random.default_rng(0))
 
 
 def test_a_module_of_one_s_own_is_the_same_from_the_same_seed_and_disturbs_nothing(run_config):
     config = run_config(ppo={"network": LAYER_NORM}).ppo
     before = torch.get_rng_state()
     one, same, other = (
-        network(config, "compiled", 5, 3, 1.0, np.random.default_rng(seed)) for seed in (0, 0, 1)
+        TorchNetwork(custom_module(config.network, [16], 5, 3, np.random.default_rng(seed)))
+        for seed in (0, 0, 1)
     )
-    assert isinstance(one, TorchNetwork)
     assert (one.parameters == same.parameters).all() and (one.parameters != other.parameters).any()
+    inputs = drawn(np.random.default_rng(2), (9, 5))
+    expected = one.module()(torch.from_numpy(inputs)).detach()
+    one.move_to(np.zeros_like(one.parameters))
+    assert (one.outputs(inputs) == expected.numpy()).all()
     assert (torch.get_rng_state() == before).all()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.novelty import CountNovelty, DensityNovelty
 from mace_rl.config.bonus import NoveltyConfig
+from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.streams import Streams
 
 SIZE = 3
@@ -35,7 +35,7 @@ def settings(**changes) -> NoveltyConfig:
 
 def make(size=SIZE, **changes) -> DensityNovelty:
     normaliser = RunningNormaliser(size)
-    return DensityNovelty(settings(**changes), "compiled", normaliser, Streams(0))
+    return DensityNovelty(settings(**changes), normaliser, Streams(0))
 
 
 def observe(novelty: DensityNovelty, states: np.ndarray) -> None:

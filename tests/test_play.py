@@ -51,7 +51,7 @@ def test_agent_is_torch_modules_that_act_as_the_trainer_does(
     assert (agent.policy.mean != 0).any() == box
     for kind, critic in trainer.ppo.critics.items():
         values = agent.critics[kind](torch.from_numpy(rows)).detach()
-        np.testing.assert_allclose(values[:, 0], critic.values(rows), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(values[:, 0], critic.outputs(rows)[:, 0], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

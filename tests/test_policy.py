@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from shared import ENGINES, Twin
+from shared import ENGINES, Twin, acting
 
-from mace_rl.agent.network import mlp
+from mace_rl.agent.distribution import log_prob_gradient
 from mace_rl.agent.policy import CompiledActing, NetworkActing, Policy
+from mace_rl.numerics.network import mlp
 
 SPACES = {"Discrete": Discrete(4), "Box": Box(-1, 1, (3,), np.float32)}
 SIZE = 5
@@ -26,9 +27,7 @@ def random_policy(space="Discrete", engine="compiled", hidden=(7, 6), scale=1.0,
     return policy
 
 
-def acting(policy: Policy):
-    """The policy for rollouts, without normalisation."""
-    return policy.for_acting(np.zeros(SIZE), np.ones(SIZE), np.inf)
+PLAIN = np.zeros(SIZE), np.ones(SIZE), np.inf  # no normalisation
 
 
 def steps(policy: Policy, count=50, seed=1):
@@ -43,35 +42,40 @@ def steps(policy: Policy, count=50, seed=1):
 def test_a_new_policy_is_nearly_uniform(make_ppo):
     observations = np.random.default_rng(0).standard_normal((100, 4)).astype(np.float32)
     policy = make_ppo("CartPole-v1").policy
-    log_probs = policy.log_probs(policy.forward(observations).outputs, np.zeros(100, np.int64))
+    log_probs = policy.log_probs(policy.network.outputs(observations), np.zeros(100, np.int64))
     np.testing.assert_allclose(np.exp(log_probs), 1 / 2, atol=0.02)
     gaussian = make_ppo("Pendulum-v1", initial_log_std=-0.7).policy
-    assert np.abs(gaussian.forward(observations[:, :3]).outputs).max() < 0.1
+    assert np.abs(gaussian.network.outputs(observations[:, :3])).max() < 0.1
     assert len(policy.log_std) == 0 and (gaussian.log_std == np.float32(-0.7)).all()
 
 
-@both_engines
 @both_spaces
 @pytest.mark.parametrize(("scale", "entropy_weight"), [(0.5, 0.0), (0.5, 0.3), (2.0, 0.3)])
-def test_log_probs_and_gradient_equal_autograd(space, engine, scale, entropy_weight):
-    """Through torch.distributions, in double precision."""
-    policy = random_policy(space, engine, scale=scale)
+def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
+    """Through torch.distributions, in double precision; at the network's outputs and log_std."""
+    policy = random_policy(space, scale=scale)
     observations, actions = steps(policy)
-    weights = np.random.default_rng(2).standard_normal(len(actions))
-    twin = Twin(policy)
-    expected = twin.policy(observations)
-    log_probs, total = expected.log_prob(torch.from_numpy(actions)), expected.entropy().sum()
-    objective = (log_probs * torch.from_numpy(weights)).sum() + entropy_weight * total
-    trace = policy.forward(observations)
-    found = policy.log_probs(trace.outputs, actions)
+    outputs, weights = policy.network.outputs(observations), np.linspace(-2, 2, len(actions))
+    leaves = [
+        torch.from_numpy(part).double().requires_grad_() for part in (outputs, policy.log_std)
+    ]
+    if policy.discrete:
+        expected = torch.distributions.Categorical(logits=leaves[0])
+    else:
+        normal = torch.distributions.Normal(leaves[0], leaves[1].exp())
+        expected = torch.distributions.Independent(normal, 1)
+    log_probs, entropies = expected.log_prob(torch.from_numpy(actions)), expected.entropy()
+    objective = (log_probs * torch.from_numpy(weights)).sum() + entropy_weight * entropies.sum()
+    gradients = torch.autograd.grad(objective, leaves, materialize_grads=True)
+    found = policy.log_probs(outputs, actions)
     np.testing.assert_allclose(found, log_probs.detach(), rtol=1e-4, atol=1e-4)
-    sums = np.array([1.0, 2.0, 3.0])  # only the last one is the entropy's
-    weights = weights.astype(np.float32)
-    found = policy.gradient(trace, actions, weights, entropy_weight, sums)
-    expected = twin.gradient(objective)
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-    assert sums.tolist() == pytest.approx([1, 2, 3 + total.item()], rel=1e-4)
-    assert (policy.gradient(trace, actions, weights, entropy_weight) == found).all()
+    grad_log_std = np.ones_like(policy.log_std)  # to which it is added
+    given = outputs, policy.log_std, actions, weights.astype(np.float32), entropy_weight
+    grad, found = log_prob_gradient(*given, grad_log_std)
+    np.testing.assert_allclose(found, entropies.detach(), rtol=1e-4)
+    np.testing.assert_allclose(grad[:, : outputs.shape[1]], gradients[0], rtol=1e-3, atol=1e-4)
+    assert grad.shape == (50, 16) and not grad[:, outputs.shape[1] :].any()
+    np.testing.assert_allclose(grad_log_std - 1, gradients[1], rtol=1e-3, atol=1e-3)
 
 
 # --- Acting -------------------------------------------------------------------------------------
@@ -83,7 +87,7 @@ def test_acting_normalises_observations_and_follows_the_policy(engine, hidden):
     rng = np.random.default_rng(3)
     policy = random_policy(engine=engine, hidden=hidden)
     mean, std = rng.standard_normal(SIZE), np.exp(rng.standard_normal(SIZE))
-    actor = policy.for_acting(mean, std, 1.5)
+    actor = acting(policy, mean, std, 1.5)
     assert isinstance(actor, CompiledActing if engine == "compiled" else NetworkActing)
     policy.parameters += 0.1 * Twin(policy).own()  # an update after the actor was made
     observations = (mean + 2 * std * rng.standard_normal((200, SIZE))).astype(np.float32)
@@ -102,12 +106,12 @@ def test_discrete_action_is_the_inverse_distribution_function(engine):
     biases = policy.parameters[-16 if engine == "compiled" else -4 :][:4]
     biases[:] = np.log([0.1, 0.2, 0.3, 0.4])
     uniforms = (0.0, 0.099, 0.101, 0.299, 0.301, 0.599, 0.601, np.nextafter(1, 0))
-    drawn = [int(acting(policy).act(observation, uniform)[0]) for uniform in uniforms]
+    drawn = [int(acting(policy, *PLAIN).act(observation, uniform)[0]) for uniform in uniforms]
     assert drawn == [0, 0, 1, 1, 2, 2, 3, 3]
     biases[:] = [500, -500, 0, -1000]  # very certain: logarithms stay finite
     for uniform in (0.0, 0.5, 0.999):
-        assert acting(policy).act(observation, uniform) == (0, 0)
-    outputs = policy.forward(observation[None].repeat(4, 0)).outputs
+        assert acting(policy, *PLAIN).act(observation, uniform) == (0, 0)
+    outputs = policy.network.outputs(observation[None].repeat(4, 0))
     log_probs = policy.log_probs(outputs, np.arange(4))
     np.testing.assert_array_equal(log_probs, np.float32([0, -1000, -500, -1500]))
 
@@ -117,7 +121,7 @@ def test_box_actions_are_mean_plus_std_times_noise(engine):
     policy = random_policy("Box", engine, scale=0.7)
     observations, _ = steps(policy)
     noise = np.random.default_rng(6).standard_normal((len(observations), 3))
-    drawn = [acting(policy).act(*pair) for pair in zip(observations, noise, strict=True)]
+    drawn = [acting(policy, *PLAIN).act(*pair) for pair in zip(observations, noise, strict=True)]
     actions, log_probs = (np.stack(parts) for parts in zip(*drawn, strict=True))
     assert actions.dtype == np.float32
     expected = Twin(policy).policy(observations)
@@ -133,8 +137,8 @@ def test_acting_has_the_bits_of_the_batch(space):
     observations, _ = steps(policy, 100)
     rng = np.random.default_rng(8)
     noise = rng.random(100) if policy.discrete else rng.standard_normal((100, 3))
-    drawn = [acting(policy).act(*pair) for pair in zip(observations, noise, strict=True)]
+    drawn = [acting(policy, *PLAIN).act(*pair) for pair in zip(observations, noise, strict=True)]
     actions, log_probs = (np.array(parts) for parts in zip(*drawn, strict=True))
-    found = policy.log_probs(policy.forward(observations).outputs, actions)
+    found = policy.log_probs(policy.network.outputs(observations), actions)
     assert found.dtype == np.float32 and (found == log_probs).all()
     assert len(np.unique(found)) > 90

@@ -15,8 +15,7 @@ from numba import njit
 from numba.core.registry import cpu_target
 from scipy import special
 
-from mace_rl.agent import elementary, products
-from mace_rl.beta.lstm import sigmoid
+from mace_rl.numerics import elementary, products
 
 SIZES = st.integers(1, 13)
 
@@ -85,7 +84,7 @@ def over(function, values):
         (elementary.log, np.log, 0.5, 2.0, 1.2e-7, 1e-9),
         (elementary.tanh, np.tanh, -12.0, 12.0, 0.0, 2e-7),
         (elementary.tanh, np.tanh, 1e-30, 1.0, 4e-7, 0.0),
-        (sigmoid, special.expit, -30.0, 30.0, 0.0, 2e-7),
+        (elementary.sigmoid, special.expit, -30.0, 30.0, 0.0, 2e-7),
     ],
 )
 def test_elementary_functions_are_as_exact_as_they_say(ours, exact, low, high, relative, absolute):
@@ -101,7 +100,7 @@ def test_elementary_functions_are_as_exact_as_they_say(ours, exact, low, high, r
         (elementary.exp, [nan, inf, -inf, 89, -104, 0], [nan, inf, 0, inf, 0, 1]),
         (elementary.log, [nan, inf], [nan, inf]),
         (elementary.tanh, [nan, inf, -inf], [nan, 1, -1]),
-        (sigmoid, [nan, inf, -inf], [nan, 1, 0]),
+        (elementary.sigmoid, [nan, inf, -inf], [nan, 1, 0]),
     ],
 )
 def test_elementary_functions_at_the_ends(ours, values, expected):
@@ -112,7 +111,7 @@ def test_elementary_functions_at_the_ends(ours, values, expected):
 
 DIGEST = """
 import mace_rl.pins, hashlib, numpy as np
-from mace_rl.agent import products
+from mace_rl.numerics import products
 from mace_rl.trainer import Trainer
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.study.config import read_study

@@ -4,10 +4,9 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
-from shared import ENGINES, environment_of
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from shared import ENGINES, Bonanza, acting, environment_of
 
-from mace_rl.agent.network import mlp
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import classic_control
@@ -20,6 +19,7 @@ from mace_rl.environments.rollout import (
     roll_out_compiled,
     rollout_for,
 )
+from mace_rl.numerics.network import mlp
 
 CLASSIC = ["CartPole-v1", "Acrobot-v1"]
 
@@ -31,17 +31,15 @@ def bits(episode: Episode) -> list[tuple]:
 
 def new_policy(environment: Environment, hidden, rng, log_std=0.0, engine="compiled") -> Policy:
     """A policy as training starts with it."""
-    space = environment.action_space
-    outputs = int(space.n) if isinstance(space, Discrete) else space.shape[0]
-    module = mlp([environment.observation_size, *hidden, outputs], 0.01, rng)
-    return Policy(ENGINES[engine](module), space, log_std)
+    module = mlp([environment.observation_size, *hidden, environment.action_size], 0.01, rng)
+    return Policy(ENGINES[engine](module), environment.action_space, log_std)
 
 
 def uniform_policy(environment: Environment, **settings) -> ActingPolicy:
     """Nearly the same distribution in every state."""
     size = environment.observation_size
     policy = new_policy(environment, [4], np.random.default_rng(0), **settings)
-    return policy.for_acting(np.zeros(size), np.ones(size), np.inf)
+    return acting(policy, np.zeros(size), np.ones(size), np.inf)
 
 
 def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
@@ -50,7 +48,7 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
     policy = new_policy(environment, [4] if kind == "skilled" else [64, 64], rng)
     if kind == "erratic":  # and normalised, as in training with normalise_observations
         policy.parameters[:] = 2 * rng.standard_normal(len(policy.parameters))
-        return policy.for_acting(rng.standard_normal(size), np.exp(rng.standard_normal(size)), 1.5)
+        return acting(policy, rng.standard_normal(size), np.exp(rng.standard_normal(size)), 1.5)
     # Balances CartPole to the time limit; swings Acrobot up.
     policy.parameters[:] = 0
     (weights, _), (readout, _) = policy.network.layers(policy.network.parameters)
@@ -60,7 +58,7 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
         weights[4, 0] = -0.5
     sharpness = rng.uniform(20, 60)
     readout[0, [0, -1]] = [-sharpness, sharpness]
-    return policy.for_acting(np.zeros(size), np.ones(size), np.inf)
+    return acting(policy, np.zeros(size), np.ones(size), np.inf)
 
 
 def play(environment: Environment) -> Episode:
@@ -253,10 +251,23 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
     ("spaces", "limit", "message"),
     [
         ({}, None, "has no time limit .*set one"),
+        ({}, 10**9, "has a time limit of 1000000000 .*set one of 1 to 1000000"),
         ({"observation_space": MultiBinary(3)}, 10, "multibinary observations.*Discrete ones work"),
         ({"observation_space": Box(0, 255, (8, 8, 3), np.uint8)}, 10, "image observations, Box"),
         ({"action_space": MultiDiscrete([2, 2])}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, (2, 2))}, 10, "Discrete and one-dim"),
+        ({"action_space": Box(-1, 1, ())}, 10, "Discrete and one-dim"),
+        ({"action_space": Box(-1, 1, (0,))}, 10, "has 0 numbers"),
+        ({"action_space": Box(0, 9, (1,), np.int64)}, 10, "of integers"),
+        ({"action_space": Discrete(10**9)}, 10, "has 1000000000 numbers"),
+        *(
+            ({"observation_space": Tuple([Dict({"a": part}), Discrete(2)])}, 10, message)
+            for part, message in [
+                (Box(0, 255, (8, 8, 3), np.uint8), "image observations"),
+                (Discrete(10**9), "has 1000000000 numbers"),
+                (Dict({}), "dict observations"),
+            ]
+        ),
         (None, 10, ""),
     ],
 )
@@ -266,6 +277,48 @@ def test_environments_that_do_not_fit_are_refused_by_name(register, spaces, limi
         register("Unfit-v0", type("Unfit", (gymnasium.Env,), plain | spaces), limit)
     with pytest.raises(ConfigError, match=rf"^[^\n]*Unfit-v0[^\n]*{message}[^\n]*$"):
         environment_of("Unfit-v0")
+
+
+class Odd(Bonanza):
+    """Its `method` does something else."""
+
+    def __init__(self, method, does):
+        super().__init__()
+        self.odd = method, does
+        setattr(self, method, does)
+
+    def reset(self, **given):
+        found = super().reset(**given)
+        setattr(self, *self.odd)
+        return found
+
+
+@pytest.mark.parametrize(
+    ("method", "does", "message"),
+    [
+        (
+            "reset",
+            lambda **_: np.zeros(2),
+            r"'Odd-v0': TypeError: reset gave array\(\[0., 0.\]\), not",
+        ),
+        ("reset", lambda: None, "'Odd-v0': TypeError: .*unexpected keyword argument 'seed'"),
+        ("reset", lambda **_: 1 / 0, r"'Odd-v0': ZeroDivisionError: .*test_rollout.py:\d+"),
+        ("np_random", np.random.RandomState(0), "np_random is a RandomState, not a Generator"),
+        ("step", lambda _: (np.zeros(2), 0, True, {}), "step 1: not .*expected 5, got 4"),
+        ("step", lambda _: (None, 0, True, False, {}), "the observation None .* after step 1"),
+        ("step", lambda _: (np.zeros(2), [1, 2], True, False, {}), "as reward after step 1"),
+        ("step", lambda _: (np.zeros(2), 0, None, False, {}), "None as terminated after step 1"),
+        ("step", lambda _: (np.zeros((2, 1)), np.ones(1), np.True_, [0], None), ""),
+    ],
+)
+def test_what_is_not_gymnasium_s_form_is_told_in_one_line(register, method, does, message):
+    """And arrays of one are taken for the number in them."""
+    register("Odd-v0", Odd, 5, method=method, does=does)
+    if not message:
+        assert play(environment_of("Odd-v0")).rewards.tolist() == [1.0]
+        return
+    with pytest.raises(ConfigError, match=rf"^environment [^\n]*{message}[^\n]*$"):
+        play(environment_of("Odd-v0"))
 
 
 def test_tuples_are_flattened():

@@ -7,7 +7,10 @@ import json
 import logging
 import os
 import pickle
+import random
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,12 +18,14 @@ import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete
 from shared import (
     ENVIRONMENTS,
     LAYER_NORM,
@@ -37,7 +42,7 @@ from mace_rl import sources
 from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.environments import hopper
-from mace_rl.files import LOCK
+from mace_rl.files import LOCK, write_atomically
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
 from mace_rl.trainer import Trainer
@@ -76,20 +81,42 @@ def test_tables_hold_the_records_to_the_bit_and_run_json_says_where_they_come_fr
 
 
 def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e", *words]
+    """Of the package's own checkout, whatever git is told about others, and whoever owns it."""
+
+    def git(folder: Path, *words: str) -> str:
+        command = ["git", "-C", str(folder), "-c", "user.name=n", "-c", "user.email=e", *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    monkeypatch.setattr(provenance.sources, "PACKAGE", tmp_path)
-    assert provenance.git_state() == {"commit": None, "dirty": None}
-    (tmp_path / "code.py").write_text("1\n")
-    for command in ("init", "add code.py", "commit -m one"):
-        git(*command.split())
-    (tmp_path / "notes").touch()  # not tracked
-    clean = {"commit": git("rev-parse", "HEAD"), "dirty": False}
+    def committed(folder: Path) -> str:
+        for command in ("init", "add .", "commit -m one"):
+            git(folder, *command.split())
+        return git(folder, "rev-parse", "HEAD")
+
+    project = tmp_path / "outer" / "project"
+    code = project / "src" / "mace_rl" / "runs" / "provenance.py"
+    code.parent.mkdir(parents=True)
+    code.write_text("1\n")
+    monkeypatch.setattr(provenance.sources, "PACKAGE", project / "src" / "mace_rl")
+    unknown = provenance.git_state()
+    assert "not a git repository" in unknown.pop("reason")
+    assert unknown == {"commit": None, "dirty": None}
+    (project.parent / "own.txt").touch()
+    committed(project.parent)  # has the package in its folder, and in its commit
+    assert "not a git repository" in provenance.git_state()["reason"]
+    clean = {"commit": committed(project), "dirty": False}
+    (project / "notes").touch()  # not tracked
     assert provenance.git_state() == clean
-    (tmp_path / "code.py").write_text("2\n")
+    code.write_text("2\n")
+    for name in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_COMMON_DIR"):
+        monkeypatch.setenv(name, str(project.parent / ".git"))
     assert provenance.git_state() == clean | {"dirty": True}
+    if os.geteuid() == 0:
+        os.chown(project, 12345, 12345)
+        os.chown(project / ".git", 12345, 12345)
+        assert provenance.git_state() == clean | {"dirty": True}
+    site = shutil.copytree(project / "src", project / "lib" / "site-packages")  # installed there
+    monkeypatch.setattr(provenance.sources, "PACKAGE", site / "mace_rl")
+    assert "not a git repository" in provenance.git_state()["reason"]
 
 
 @pytest.mark.parametrize(
@@ -243,6 +270,45 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
     timer.join()
 
 
+JOB = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from job import job
+with job("it", "log"):
+    raise eval(sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ends", "closed"), [("SystemExit(0)", ""), ("GeneratorExit()", ">&- 2>&-")]
+)
+def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
+    scripts = Path(__file__).parents[1] / "workflow" / "scripts"
+    command = shlex.join([sys.executable, "-c", JOB, str(scripts), ends])
+    assert subprocess.run(["sh", "-c", f"{command} {closed}"], cwd=tmp_path).returncode == 1
+    assert (
+        f" it failed: {ends.partition('(')[0]}" in (tmp_path / "log").read_text().splitlines()[-1]
+    )
+
+
+def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    asleep, wake = os.pipe()
+    with run.exclusive(tmp_path):
+        worker = os.fork()
+        if not worker:
+            os.close(wake)
+            os.read(asleep, 1)
+            os._exit(0)
+        with pytest.raises(run.RunError), run.exclusive(tmp_path):
+            pass
+    with run.exclusive(tmp_path):
+        assert os.waitpid(worker, os.WNOHANG) == (0, 0)  # it lives
+    os.close(wake)
+    os.waitpid(worker, 0)
+
+
 @pytest.mark.parametrize(
     ("file", "time", "left", "after"),
     [("run.json", 1, [*UNFINISHED, *OUTCOME], 6), ("checkpoint.pt", 5, UNFINISHED, 4)],
@@ -268,6 +334,16 @@ def test_killed_while_writing(
     (directory / ".checkpoint.pt.12345.tmp").write_bytes(b"half a check")  # goes
     (interruption,) = completes(config, directory)["interruptions"]
     assert interruption["after_episode"] == after
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*/episodes\.csv'"):
+        write_atomically(tmp_path / "episodes.csv", "")
+    assert not list(tmp_path.iterdir())
 
 
 def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path, monkeypatch):
@@ -316,35 +392,145 @@ def test_damaged_checkpoint_is_not_continued(
     """Nor is anything executed that is in it."""
     monkeypatch.chdir(tmp_path)
     path = interrupted.directory / "checkpoint.pt"
-    path.write_bytes(damage(path.read_bytes()))
+    path.write_bytes(content := damage(path.read_bytes()))
     assert completes(interrupted.config, interrupted.directory)["interruptions"] == []
     assert f"starting afresh: {path}: {message}" in caplog.text
+    assert (path.parent / "_aside1" / "checkpoint.pt").read_bytes() == content
     assert not Path("executed").exists()
 
 
-def test_checkpoint_of_another_run_is_not_continued(interrupted, monkeypatch, caplog, kill):
-    """Each time it is killed before its first checkpoint, so that the old one stays."""
+def everything(directory: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in directory.iterdir() if p.is_file() and p.name != LOCK}
+
+
+def test_another_unfinished_run_is_neither_continued_nor_lost(
+    interrupted, monkeypatch, caplog, kill
+):
     config, directory = interrupted.config, interrupted.directory
-    for changes, message in (
-        ({"seed": 1}, "config.seed was 0 and is 1"),
-        ({"ppo": {"clip": 0.3}}, "config.ppo.clip was 0.2 and is 0.3"),
-        ({"beta": {"kind": "none"}}, "config.beta.kind was 'meta' and is 'none'"),
-    ):
-        settings = merge_layers(config.settings(), changes)
-        kill(1, RunConfig.model_validate(settings), directory)
-        assert f"afresh: {directory}/checkpoint.pt: of another run: {message}" in caplog.text
+    before = everything(directory)
     found = provenance.versions()
-    for place, name, replaced, message in (
-        (provenance, "versions", lambda: found | {"torch": "9.9"}, "versions.torch was "),
-        (sources, "digest", lambda *paths: "0" * 64, "sources was "),
-    ):
+    others = [
+        ({"seed": 1}, None, "config.seed was 0 and is 1"),
+        ({"ppo": {"clip": 0.3}}, None, "config.ppo.clip was 0.2 and is 0.3"),
+        ({"beta": {"kind": "none"}}, None, "config.beta.kind was 'meta' and is 'none'"),
+        ({}, (provenance, "versions", lambda: found | {"torch": "9.9"}), "versions.torch was "),
+        ({}, (sources, "digest", lambda *paths: "0" * 64), "unfinished run of other code, in mace"),
+    ]
+    for number, (changes, replaced, message) in enumerate(others, start=1):
+        other = RunConfig.model_validate(merge_layers(config.settings(), changes))
         with monkeypatch.context() as patched:
-            patched.setattr(place, name, replaced)
-            kill(1, config, directory)
-        assert message in caplog.text
-    caplog.clear()
-    run.run(config, directory)
-    assert "afresh" not in caplog.text
+            if replaced:
+                patched.setattr(*replaced)
+            with pytest.raises(run.RunError, match=f"holds an .*{message}.*--restart"):
+                run.run(other, directory)
+            assert everything(directory) == before
+            with pytest.raises(Killed):
+                patched.setattr(Trainer, "improve", Mock(side_effect=Killed))
+                run.run(other, directory, aside="others")  # as the workflow does
+        aside = directory / f"_aside{number}"
+        assert message in caplog.text and everything(aside) == before
+        shutil.copytree(aside, directory, dirs_exist_ok=True)
+    with pytest.raises(Killed), monkeypatch.context() as patched:
+        patched.setattr(Trainer, "improve", Mock(side_effect=Killed))
+        run.run(config, directory, aside="all")
+    assert everything(directory) == {} and everything(directory / "_aside6") == before
+    run.run(config, directory / "_aside6")
+    assert len(provenance_of(directory / "_aside6")["interruptions"]) == 1
+
+
+@pytest.mark.parametrize(
+    "name", [*RESULTS[:3], "checkpoint.pt", "progress.json", ".notes.tmp", ".agent.pt.1.tmp"]
+)
+def test_somebody_s_files_stay(run_config, tmp_path, name):
+    """Refused where they are in the way."""
+    (tmp_path / name).write_text("mine")
+    before = everything(tmp_path)
+    config = run_config("CartPole-v1", "ppo", 0, episodes=2)
+    for _ in range(2):
+        if not name.startswith("."):
+            with pytest.raises(run.RunError, match=f"{name}.*choose another folder"):
+                run.run(config, tmp_path)
+            assert everything(tmp_path) == before
+    run.run(config, tmp_path, aside="all")
+    assert (tmp_path / ("" if name.startswith(".") else "_aside1") / name).read_text() == "mine"
+
+
+class Draws(gymnasium.Env):
+    """Pays what it draws, from what `kind` says."""
+
+    observation_space, action_space = Box(-9, 9, (1,), np.float32), Discrete(2)
+
+    def __init__(self, kind: str) -> None:
+        self.kind, self.own, self.resets, self.kept = kind, np.random.default_rng(1), 0, []
+        if kind.startswith("offered"):
+            self.load_state_dict = lambda state: vars(self).update(resets=state["resets"])
+
+    def state_dict(self) -> dict:
+        return {"resets": np.int64(1) if self.kind == "offered badly" else self.resets}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.resets += 1
+        self.kept += [*self.np_random.random(3 * (self.kind == "kept"))]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        pays = {
+            "np_random": self.np_random.random,
+            "own": self.own.random,
+            "random": random.random,
+            "numpy": np.random.random,
+            "torch": lambda: float(torch.rand(())),
+            "kept": lambda: self.kept.pop() if self.kept else 0.0,
+        }
+        reward = pays.get(self.kind, lambda: self.resets / 100)()
+        return np.full(1, reward, np.float32), reward, False, False, {}
+
+
+def seed_all(seed: int) -> None:
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+    torch.manual_seed(seed)
+
+
+@pytest.mark.parametrize(
+    ("kind", "saved"),
+    [
+        *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered")),
+        *((kind, False) for kind in ("own", "kept", "counter")),
+        *((name, True) for name in ("FrozenLake-v1", "Pendulum-v1", "AntBulletEnv-v0")),
+        ("HumanoidFlagrunHarderBulletEnv-v0", False),
+    ],
+)
+def test_what_else_an_environment_draws_from_is_saved_or_noticed(
+    run_config, register, tmp_path, kill, checkpoint_every, caplog, kind, saved
+):
+    """By a replay of the last episodes, which changes nothing."""
+    name = kind if "-v" in kind else register("Draws-v0", Draws, 5, kind=kind)
+    config = run_config(name, "ppo", 0, episodes=30, max_episode_steps=60 if "-v" in kind else 5)
+    checkpoint_every(1)
+    for folder in ("killed", "whole"):
+        seed_all(1)
+        if folder == "killed":
+            kill(29, config, tmp_path / folder)
+            seed_all(2)  # another process
+        run.run(config, tmp_path / folder)
+    (interruption,) = provenance_of(tmp_path / "killed")["interruptions"]
+    assert interruption["environment_replayed"] == saved
+    assert (f"{name} plays its last episodes otherwise" in caplog.text) == (not saved)
+    one, other = (
+        (tmp_path / folder / "episodes.csv").read_bytes() for folder in ("killed", "whole")
+    )
+    assert one == other or not saved
+
+
+def test_a_state_that_would_not_be_read_again_is_named_before_training(
+    run_config, register, tmp_path
+):
+    name = register("Draws-v0", Draws, 5, kind="offered badly")
+    message = r"state.environment.own.resets is np.int64\(1\), but should be a tensor"
+    with pytest.raises(checkpoint.CheckpointError, match=message):
+        run.run(run_config(name, "ppo", 0, episodes=2), tmp_path)
 
 
 @pytest.mark.parametrize("said", ["often", "-1", "nan", ""])

@@ -1,8 +1,11 @@
 """The set-up: what `make` does when all is well and when it is not."""
 
+import json
 import os
+import re
 import shutil
 import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -109,3 +112,72 @@ def test_another_python_is_refused_in_one_line(checkout, settings):
 def test_any_other_failure_shows_the_end_of_pips_output(checkout):
     assert "the cause" in make(checkout, BREAK="-r environment.lock")[1]
     assert "the cause" in (checkout / "setup.log").read_text()
+
+
+HIDDEN = re.compile("python|pip|uv|pydoc")
+
+
+@pytest.fixture
+def without_python(tmp_path, monkeypatch):
+    """A search path with this machine's programs but its Pythons; returns the folder."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for program in [*Path("/bin").iterdir(), *Path("/usr/bin").iterdir()]:
+        if not HIDDEN.match(program.name) and not (folder / program.name).exists():
+            (folder / program.name).symlink_to(program)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.setenv("MAKEFLAGS", "")
+    monkeypatch.delenv("PYTHON", raising=False)
+    return folder
+
+
+def fetched(checkout):
+    """Standard output and error of what fetches a Python."""
+    command = ["make", "--silent", "fetched"]
+    run = subprocess.run(command, cwd=checkout, capture_output=True, text=True, timeout=300)
+    return run.stdout.strip(), run.stderr
+
+
+PYTHON3 = {  # what is there to begin with, and what is said
+    "": "python3 makes no environment for uv, which would fetch it (Debian, Ubuntu: apt install",
+    "mkdir -p $3/bin; echo exit 1 >$3/bin/python; chmod +x $3/bin/python": "pip cannot install uv",
+}
+
+
+@pytest.mark.parametrize("python3", PYTHON3)
+def test_without_a_python_one_line_says_what_to_do(checkout, without_python, python3):
+    if python3:
+        (without_python / "python3").write_text(f"#!/bin/sh\n{python3}\n")
+        (without_python / "python3").chmod(0o755)
+    path, said = fetched(checkout)
+    assert (path, said.count("\n")) == ("", 1)
+    assert said.startswith(f"This needs Python 3.11: there is none, and {PYTHON3[python3]}")
+
+
+def test_uv_fetches_a_python_where_there_is_none(checkout, without_python, monkeypatch):
+    """From a mirror of this one. Its list, too: uv knows by heart what the real ones hash to."""
+    version, place = "{}.{}.{}".format(*sys.version_info), checkout.parent / "mirror" / "1"
+    name = f"cpython-{version}+1-x86_64-unknown-linux-gnu-install_only.tar.gz"
+    place.mkdir(parents=True)
+    ignored = shutil.ignore_patterns("site-packages", "dist-packages", "__pycache__", "test")
+    for part in ("bin/python3.11", "lib/python3.11", "lib/libpython3.11.so.1.0"):
+        target, found = place.parent / "python" / part, Path(sys.base_prefix, part)
+        if found.is_dir():
+            shutil.copytree(found, target, ignore=ignored)
+        elif found.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(found, target)
+    command = ["tar", "-C", place.parent, "-I", "gzip -1", "-cf", place / name, "python"]
+    subprocess.run(command, check=True)
+    known = {"name": "cpython", "arch": {"family": "x86_64", "variant": None}, "os": "linux"}
+    known |= dict(zip(("major", "minor", "patch"), sys.version_info[:3], strict=True))
+    known |= {"libc": "gnu", "prerelease": "", "sha256": None, "variant": None, "build": "1"}
+    releases = "https://github.com/astral-sh/python-build-standalone/releases/download"
+    listing = {f"cpython-{version}-linux-x86_64-gnu": known | {"url": f"{releases}/1/{name}"}}
+    (checkout.parent / "list.json").write_text(json.dumps(listing))
+    monkeypatch.setenv("UV_PYTHON_DOWNLOADS_JSON_URL", str(checkout.parent / "list.json"))
+    monkeypatch.setenv("UV_PYTHON_INSTALL_MIRROR", place.parent.as_uri())
+    (without_python / "python3").symlink_to(sys.executable)
+    path, said = fetched(checkout)
+    assert Path(path).is_relative_to(checkout / ".python") and said.count("\n") == 1
+    subprocess.run([path, "-c", "import ensurepip"], check=True)

@@ -131,6 +131,8 @@ results: LONG  # results, 'xxx, at most 255
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
 results: CONFIG/x  # results, CONFIG, is a file
+training: {memory: {capacity: 1000000000000}}  # memory.capacity, less than or equal to 10000000
+training: {ppo: {hidden_units: [1000000]}}  # ppo.hidden_units, less than or equal to 10000
 """
 
 

@@ -3,16 +3,22 @@
 import io
 import math
 from pathlib import Path
+from unittest.mock import Mock
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
+from gymnasium.wrappers import TransformObservation
 from shared import LAYER_NORM, VARIANTS, Bonanza, Twin, finish
 
+from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.config.reading import merge
 from mace_rl.experience import Experience
-from mace_rl.finite import NonFiniteError
+from mace_rl.numerics.finite import NonFiniteError
+from mace_rl.refusal import Refusal
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
 from mace_rl.runs.records import EpisodeRecord
@@ -21,8 +27,6 @@ from mace_rl.trainer import Trainer
 
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}
 AS_THEY_ARE = dict.fromkeys(("normalise_observations", "scale_rewards", "scale_advantages"), False)
-DICTIONARY = {"kind": "dictionary", "capacity": 150, "neighbours": 10}
-DICTIONARY |= {"kernel_bandwidth": 0.05, "learning_rate": 0.1}
 SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 NETWORKS = ["actor", "extrinsic", "intrinsic"]
 # One update per episode as in the paper's runs; several episodes with minibatches; in torch.
@@ -31,7 +35,6 @@ SETTINGS = {
     "several": {"ppo": SEVERAL},
     "torch": {"engine": "torch", "ppo": SEVERAL},
     "a network of one's own": {"ppo": {"network": LAYER_NORM}},
-    "a dictionary": {"ppo": {"critic": DICTIONARY}},
     "random": {"beta": {"kind": "random", "low": 0.2, "high": 0.7}},
     "bandit": {
         "beta": {"kind": "bandit", "arms": [0.0, 0.1, 0.4], "window": 5}
@@ -121,11 +124,11 @@ def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant, 
     settings["centre_advantages"] = centred
     trainer = Trainer(run_config("CartPole-v1", variant, 0, episodes=9, ppo=settings))
     batches, update, rollouts = [], trainer.ppo.update, rollouts_of(trainer, monkeypatch)
-    monkeypatch.setattr(trainer.ppo, "update", lambda b: (batches.append(b), update(b))[1])
+    monkeypatch.setattr(trainer.ppo, "update", lambda *b: (batches.append(b), update(*b))[1])
     finish(trainer)
     assert max(map(len, rollouts)) > 1
     seen: tuple[list, list] = [], []
-    for batch, rollout in zip(batches, rollouts, strict=True):
+    for (batch, targets), rollout in zip(batches, rollouts, strict=True):
         total = []
         for item in rollout:
             scales = []
@@ -144,10 +147,10 @@ def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant, 
         assert (batch.observations == [o for one in rollout for o in one.observations[:-1]]).all()
         assert (batch.log_probs == [p for one in played for p in one.log_probs]).all()
         kinds = ["extrinsic"] if variant == "ppo" else ["extrinsic", "intrinsic"]
-        assert list(batch.returns) == kinds
+        assert list(targets) == kinds
         for place, kind in enumerate(kinds):
             returns = [value for item in rollout for value in parts(item, "returns")[place]]
-            np.testing.assert_allclose(batch.returns[kind], returns, rtol=1e-6)
+            np.testing.assert_allclose(targets[kind], returns, rtol=1e-6)
             assert np.ptp(returns) > 0
 
 
@@ -159,7 +162,7 @@ def test_normaliser_of_the_update_is_that_of_acting(run_config):
 
     def improve_watched(rollout):
         (item,) = rollout
-        outputs = trainer.ppo.policy.forward(item.observations[:-1]).outputs
+        outputs = trainer.ppo.policy.network.outputs(item.observations[:-1])
         log_probs = trainer.ppo.policy.log_probs(outputs, item.episode.actions)
         np.testing.assert_allclose(log_probs, item.episode.log_probs, atol=1e-4)
         seen.extend(item.episode.observations[:-1].astype(np.float64))
@@ -187,20 +190,18 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
     changes = {"ppo": settings | {"minibatch_size": None}, "meta": meta}
     config = run_config(environment, variant, 1, episodes=9, **changes)
     trainer = Trainer(config)
-    rollouts, policies, norms, critics = rollouts_of(trainer, monkeypatch), [], [], []
+    rollouts, learnt, batches, critics = rollouts_of(trainer, monkeypatch), [], [], []
     update = trainer.ppo.update
     first_epoch = merge(changes, {"ppo": {"epochs": 1}})
     once = Trainer(run_config(environment, variant, 1, **first_epoch)).ppo
 
-    def noted(batch):
+    def noted(batch, returns):
         critics.append({kind: Twin(one) for kind, one in trainer.ppo.critics.items()})
         once.load_state_dict(trainer.ppo.state_dict())
-        once.update(batch)
-        policies.append(Twin(once.policy))
-        gradients = {"actor": once.actor_gradient(batch, np.zeros(3))}
-        gradients |= {kind: critic.gradient(batch) for kind, critic in once.critics.items()}
-        norms.append({name: np.linalg.norm(gradients[name].astype(float)) for name in gradients})
-        return update(batch)
+        once.update(batch, returns)
+        learnt.append({"actor": Twin(once.policy)} | {k: Twin(v) for k, v in once.critics.items()})
+        batches.append((batch, returns))
+        return update(batch, returns)
 
     monkeypatch.setattr(trainer.ppo, "update", noted)
     episodes = [records[-1] for records in trainer.run()]
@@ -208,7 +209,7 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
     for number, (row, rollout) in enumerate(zip(trainer.diagnostics, rollouts, strict=True)):
         observations = np.concatenate([item.observations[:-1] for item in rollout])
         actions = np.concatenate([item.episode.actions for item in rollout])
-        policy = policies[number].policy(observations)
+        policy = learnt[number]["actor"].policy(observations)
         old = np.concatenate([item.episode.log_probs for item in rollout])
         log_ratio = policy.log_prob(torch.from_numpy(actions)) - torch.from_numpy(old)
         ratio = log_ratio.exp()
@@ -228,7 +229,16 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
             weighted.extend(item.beta * intrinsic / item.intrinsic_scale)
         squares = np.square(own).sum(), np.square(weighted).sum()
         expected["bonus_share"] = squares[1] / sum(squares)
-        expected |= {f"gradient_norm_{name}": norm for name, norm in norms[number].items()}
+        batch, targets = batches[number]
+        advantages = torch.from_numpy(batch.advantages)
+        clipped = torch.min(ratio * advantages, ratio.clamp(0.8, 1.2) * advantages)
+        losses = {"actor": -clipped.mean()}
+        for kind, target in targets.items():
+            values = learnt[number][kind](observations)[:, 0]
+            losses[kind] = (values - torch.from_numpy(target)).square().mean()
+        for name, loss in losses.items():
+            norm = np.linalg.norm(learnt[number][name].gradient(loss))
+            expected[f"gradient_norm_{name}"] = norm
         for kind, critic in critics[number].items():
             returns = np.concatenate([getattr(item, f"{kind}_returns") for item in rollout])
             errors = returns - critic(observations)[:, 0].detach().numpy()
@@ -254,8 +264,11 @@ def without_bonus(records: list[EpisodeRecord]) -> list[dict]:
 
 def learned(trainer: Trainer) -> list[bytes]:
     """Weights and moments of the networks that plain PPO has, and its normaliser."""
-    optimisers = [trainer.ppo.optimisers[name] for name in ("actor", "extrinsic")]
-    arrays = [part for adam in optimisers for part in (adam.parameters, adam.mean, adam.square)]
+    learner, names = trainer.ppo.learner, ("actor", "extrinsic")
+    arrays = [learner.parameters[name] for name in names]
+    if isinstance(learner, CompiledLearner):
+        adams = [learner.optimisers[name] for name in names]
+        arrays += [part for adam in adams for part in (adam.mean, adam.square)]
     return [array.tobytes() for array in (*arrays, trainer.ppo.normaliser.mean)]
 
 
@@ -295,18 +308,26 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
 def test_another_seed_is_another_run(run_config):
     runs = [finish(run_config("CartPole-v1", "mace_full", seed, episodes=3)) for seed in (0, 1)]
     for name in NETWORKS:
-        states = [archive(run.ppo.optimisers[name].state_dict()) for run in runs]
+        states = [archive(run.ppo.learner.optimisers[name].state_dict()) for run in runs]
         assert states[0] != states[1], name
     states = [run.environment.generator.bit_generator.state for run in runs]
     assert states[0] != states[1] and runs[0].records != runs[1].records
 
 
-@pytest.mark.parametrize("settings", ["an episode", "a network of one's own"])
+@pytest.mark.parametrize("settings", ["an episode", "torch", "a network of one's own"])
 def test_global_generators_are_left_alone(run_config, settings):
     """Nothing depends on them, and nothing that uses them is disturbed."""
     changes = {"episodes": 4, "novelty": SOON} | SETTINGS[settings]
     config = run_config("CartPole-v1", "mace_full", 0, **changes)
     expected = finish(config).records
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        assert finish(config).records == expected
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
     np.random.seed(123)  # noqa: NPY002
     torch.manual_seed(123)
     before = np.random.get_state()[1].copy(), torch.get_rng_state()  # noqa: NPY002
@@ -325,7 +346,6 @@ def test_global_generators_are_left_alone(run_config, settings):
         ("CartPole-v1", "ppo", "torch"),
         ("FrozenLake-v1", "mace_full", "torch"),
         ("Pendulum-v1", "mace_full", "a network of one's own"),
-        ("CartPole-v1", "mace_full", "a dictionary"),
         ("CartPole-v1", "mace_fixed", "random"),
         ("CartPole-v1", "mace_fixed", "bandit"),
     ],
@@ -341,7 +361,7 @@ def test_state_holds_all_that_the_rest_depends_on(run_config, environment, varia
         next(rounds)
     state = archive(whole.state_dict())
     if variant == "mace_full" and environment != "Pendulum-v1":  # which has one episode a round
-        assert len(whole.controller.lessons) > 0  # not learned from yet
+        assert len(whole.controller.training_batch) > 0  # not learned from yet
     for _ in rounds:
         pass
     rest = Trainer(config)
@@ -413,20 +433,54 @@ def test_it_learns_what_pays(run_config, register, variant, network):
 
 @pytest.mark.parametrize(
     ("where", "value"),
-    [("reward", np.nan), ("observation", np.inf), ("first observation", -np.inf)],
+    [
+        *(("reward", value) for value in (np.nan, 1e160, -1.7e308)),
+        ("observation", np.inf),
+        ("observation", np.float32(-3e38)),
+        ("first observation", -np.inf),
+    ],
 )
-def test_bad_numbers_stop_the_run_and_say_where(run_config, register, where, value):
+@pytest.mark.parametrize(("variant", "scaled"), [("ppo", True), ("mace_full", False)])
+def test_bad_numbers_stop_the_run_and_say_where(
+    run_config, register, where, value, variant, scaled
+):
     name = register("Bonanza-v0", Bonanza, 5, where=where, value=value)
-    trainer = Trainer(run_config(name, "mace_full", 7, episodes=9))
+    settings = {"scale_rewards": scaled, "scale_advantages": scaled}
+    trainer = Trainer(run_config(name, variant, 7, episodes=9, ppo=settings))
     finished = []
     with pytest.raises(NonFiniteError) as caught:
         for records in trainer.run():
             finished += records
     place = "the reset" if "first" in where else "step 3"
     what = where.removeprefix("first ")
-    message = f"Bonanza-v0 mace_full seed 7, episode 4: the {what} is {value} after {place}"
-    assert str(caught.value) == message
+    message = f"Bonanza-v0 {variant} seed 7, episode 4: the {what} is {value:g} after {place}"
+    assert str(caught.value).partition(", but float32 learns from less than 1e+12")[0] == message
     assert len(finished) == 3
+
+
+def moved(unit: float, offset: float, reward: float = 0.0) -> gymnasium.Env:
+    """Bonanza with another first dimension and a large reward."""
+    space, env = Box(-1e9, 1e9, (2,), np.float64), Bonanza("reward", reward)
+    return TransformObservation(env, lambda x: x * [unit, 1.0] + [offset, 0.0], space)
+
+
+LOST = "differences in observation[0]"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        *(((unit, offset), LOST) for unit, offset in ((1e-9, 0), (1, 1e8), (1, 1e7))),
+        *(((unit, offset), "") for unit, offset in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
+        ((1, 0, 1e11), "the rewards of episode 4"),
+    ],
+)
+def test_what_is_lost_is_named_once(run_config, register, caplog, given, said):
+    names = ("unit", "offset", "reward")
+    name = register("Moved-v0", moved, 50, **dict(zip(names, given, strict=False)))
+    finish(run_config(name, "ppo", 0, episodes=9))
+    found = [record.message.split(" are")[0] for record in caplog.records]
+    assert found == ([f"Moved-v0: {said}"] if said else [])
 
 
 @pytest.mark.parametrize("place", [0, -1])  # around every tanh
@@ -448,12 +502,12 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, part, message, place
 
     def spoil(value):
         own = np.flatnonzero(Twin(owner).own())  # none of the zeros that are added
-        owner.network.parameters[own[place]] = value
+        getattr(owner, "network", owner).parameters[own[place]] = value
 
-    def update_spoilt(batch):
+    def update_spoilt(batch, returns):
         if len(trainer.records) == 3:
             spoil(np.nan if place else np.inf)  # which a tanh hides
-        return update(batch)
+        return update(batch, returns)
 
     if part in NETWORKS:
         trainer.ppo.update = update_spoilt
@@ -461,3 +515,13 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, part, message, place
         spoil(np.nan)
     with pytest.raises(NonFiniteError, match=f"CartPole-v1 mace_full seed 0, {message}"):
         finish(trainer)
+
+
+@pytest.mark.parametrize("ends", [SystemExit(0), SystemExit("why"), GeneratorExit()], ids=repr)
+def test_code_that_ends_the_program_is_an_error(run_config, register, monkeypatch, ends):
+    name = register("Bonanza-v0", Bonanza, 5)
+    trainer = Trainer(run_config(name, "ppo", 3, episodes=9))
+    monkeypatch.setattr(Bonanza, "step", Mock(side_effect=ends))
+    with pytest.raises(Refusal, match="ppo seed 3, episode 1: code raised") as refused:
+        list(trainer.run())
+    assert repr(ends) in str(refused.value)

@@ -85,10 +85,12 @@ def test_pictures_and_speed_are_the_environments(trained, environment, rate, str
 
 def test_what_cannot_be_filmed_is_said(trained, tmp_path, register):
     register("NoDisplay-v0", NoDisplay)
+    register("Nothing-v0", type("Nothing", (NoDisplay,), {"render": lambda _: None}))
     register("NoMode-v0", lambda: CartPoleEnv())  # takes no mode, though it promises one
     for name, reason in (
         ("PlantedHelp-v0", "cannot be drawn: 'rgb_array' is not"),
         ("NoDisplay-v0", "cannot be drawn: OSError: no display"),
+        ("Nothing-v0", r"cannot be drawn: TypeError: render\(\) gives no picture"),
         ("NoMode-v0", "with .* cannot be drawn"),
     ):
         with pytest.raises(watch.RenderError, match=f"'{name}' {reason}"):

@@ -127,6 +127,10 @@ def test_everything_is_made_and_the_terminal_says_how_far_it_is(finished: Projec
     assert "6 of 6 runs to train; how far they are: mace-rl status results" in terminal
     assert "train CartPole-v1 ppo 0" in terminal and "0 of 6 runs to train" in file
     assert "Error" not in terminal + file
+    for output in (terminal, file):
+        shown = output.partition("Table 1: ")[2].splitlines()
+        assert shown[2].split() == ["Algorithm", *sorted(ENVIRONMENTS)]
+        assert max(map(len, shown)) <= 100 and "results/table1.tex" in shown[7]
     assert finished("mace-rl status results") == (0, "6 of 6 runs done\n")
     logs = [*finished["results/logs"].rglob("*.log")]
     assert len(logs) == len(RUNS) + sum(EVALUATION.values()) + 1  # Table 2
@@ -140,7 +144,9 @@ def test_time_stamps_do_not_count(finished: Project) -> None:
             os.utime(file)
     for name in ("Snakefile", "config.yaml"):
         os.utime(finished[name])
-    assert "Nothing to be done" in finished("snakemake all")[1]
+    output = finished("snakemake all")[1]
+    assert "Nothing to be done" in output
+    assert output.endswith(finished["file.log"].read_text().partition("Table 1")[2])
 
 
 TRAIN = {"train": 6, **EVALUATION}
@@ -278,10 +284,10 @@ def test_the_same_command_after_it_was_interrupted_killed_and_ended(finished: Pr
             os.killpg(process.pid, sent)
         else:
             process.send_signal(sent)  # at SIGTERM it lets jobs come to their end
-        process.wait()
-        while Path(f"/proc/{training}").exists():  # it notices that Snakemake is gone
+        while Path(f"/proc/{training}").exists():  # it notices that Snakemake is gone ...
             assert time.monotonic() < deadline
             time.sleep(0.05)
+        process.wait()  # ... even if nobody has asked how it ended
         assert (run / "run.json").exists() == (sent == signal.SIGTERM)
         told.unlink(missing_ok=True)
         output = finished["killed.log"].read_text()

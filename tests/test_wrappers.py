@@ -27,7 +27,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import CuriosityConfig, defaults
 from mace_rl.environments.planted import FlagNovelty
 from mace_rl.environments.rollout import Episode
-from mace_rl.finite import NonFiniteError
+from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
 from mace_rl.streams import Streams
 from mace_rl.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
@@ -80,7 +80,7 @@ class ByEpisodes:
         self.beta = beta
         memory = MemoryConfig(**defaults()["memory"] | SMALL["memory"])
         novelty = NoveltyConfig(**defaults()["novelty"] | SMALL["novelty"])
-        self.curiosity = Curiosity(memory, novelty, "torch", space, size, Streams(seed))
+        self.curiosity = Curiosity(memory, novelty, space, size, Streams(seed))
         self.sums = [[], []]  # discounted, of extrinsic rewards and of bonuses
 
     def pay(self, episode: Episode) -> tuple[float, float, np.ndarray]:
@@ -136,7 +136,7 @@ def test_pays_what_the_trainer_s_curiosity_gives_for_whole_episodes(name, beta):
             assert total == info["reward_extrinsic"] + info["reward_curiosity"]
         states, rewards, episodes = [bare.reset()[0]], [], episodes + 1
     assert episodes >= 3
-    kept, memory = expected.curiosity.memory, env.appraisal.curiosity.memory
+    kept, memory = expected.curiosity.memory, env.tracker.curiosity.memory
     assert (kept.usage == memory.usage).all() and (kept.number == memory.number).all()
     assert (kept.keys == memory.keys).all()
 
@@ -186,14 +186,14 @@ def test_what_one_environment_has_seen_is_known_to_the_others():
     count = sum(0.9995**k for k in (1, 2, 3))  # of the state that the first steps led to
     assert again[4]["novelty"] == pytest.approx(np.full(3, 1 / (count + 1)))
     # One step in 10 of these 30, and the last of each episode.
-    assert len(env.appraisal.curiosity.memory) == 3 + 3
+    assert len(env.tracker.curiosity.memory) == 3 + 3
 
 
 def test_environments_that_end_at_other_times_keep_their_own_episodes(monkeypatch):
     env = VectorCuriosityReward(vector_of("CartPole-v1", 3, NEXT))
-    remembered, remember = [], env.appraisal.curiosity.remember
+    remembered, remember = [], env.tracker.curiosity.remember
     monkeypatch.setattr(
-        *(env.appraisal.curiosity, "remember"),
+        *(env.tracker.curiosity, "remember"),
         lambda *given: (remembered.append(given), remember(*given)),
     )
     found = play(env, 300)
@@ -226,7 +226,7 @@ class Everything(FlagNovelty):
     """A novelty of the user's own: the same everywhere."""
 
     def __init__(self, size, generator, value):
-        self.value = value
+        self.value = float(value)  # NaN is no argument, but as text
 
     def __call__(self, states):
         return np.full(len(states), self.value)
@@ -235,7 +235,7 @@ class Everything(FlagNovelty):
 def test_a_rule_of_the_user_s_own_sees_whole_episodes():
     env = CuriosityReward(gymnasium.make("Pendulum-v1"), OWN)
     found = play(env, 450)
-    (first, bonus), (second, _) = env.appraisal.controller.shown
+    (first, bonus), (second, _) = env.tracker.controller.shown
     assert len(first) == len(second) == 200 and not first.terminated
     assert first.actions.shape == (200, 1) and first.actions.dtype == np.float32
     assert bonus.tolist() == [info["curiosity"] for *_, info in found[:200]]
@@ -248,12 +248,12 @@ def test_a_rule_of_the_user_s_own_sees_whole_episodes():
 
 @pytest.mark.parametrize("value", [0.25, 1.25, -0.5, np.nan])
 def test_a_novelty_of_the_user_s_own_is_asked_for_every_state(value):
-    own = {"estimator": "test_wrappers:Everything", "arguments": {"value": value}}
+    own = {"estimator": "test_wrappers:Everything", "arguments": {"value": str(value)}}
     settings = {"novelty": {"kind": "custom", **own}, "relevance": False}
     env = CuriosityReward(gymnasium.make("CartPole-v1"), **settings)
     if value == 0.25:
         assert {info["curiosity"] for *_, info in play(env, 100)} == {0.25}
-        assert env.appraisal.curiosity.memory is None
+        assert env.tracker.curiosity.memory is None
         return
     with pytest.raises(NonFiniteError, match=f"the curiosity bonus is {value}"):
         play(env, 1)
@@ -351,7 +351,7 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
 def test_defaults_are_the_study_s():
     file = Path(__file__).parents[1] / "config.yaml"
     training = yaml.safe_load(file.read_text(encoding="utf-8"))["training"]
-    config = CuriosityReward(gymnasium.make("CartPole-v1")).appraisal.config
+    config = CuriosityReward(gymnasium.make("CartPole-v1")).tracker.config
     sections = {name: training[name] for name in ("memory", "novelty")}
     assert config == CuriosityConfig(beta=0.4, **sections)
     assert config.discount == training["ppo"]["discount"]
@@ -433,18 +433,34 @@ GOOD, THREE = np.zeros(4, np.float32), Discrete(3, start=5)
         (
             observing([GOOD, []]),
             ConfigError,
-            r"gave an observation of shape \(0,\), but its observation_space",
+            r"the observation \[\] of shape \(0,\) after step 1, but its observation_space",
         ),
-        (observing([GOOD, [0]]), ConfigError, r"of shape \(1,\), but"),  # numpy would stretch it
-        (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\), but"),
-        (observing([5, 6, 7, 8], THREE), ConfigError, "number 8, but its observation_space is"),
-        (observing([4], THREE), ConfigError, "number 4, but its observation_space is"),
+        (
+            observing([GOOD, [0]]),
+            ConfigError,
+            r"of shape \(1,\) after step 1, but",
+        ),  # numpy would stretch it
+        (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\) after step 1, but"),
+        (observing([5, 6, 7, 8], THREE), ConfigError, "observation 8 of shape .* after step 3"),
+        (observing([4], THREE), ConfigError, "observation 4 of shape .* after the reset"),
         (paying(np.nan), NonFiniteError, "the reward is nan after step 3"),
         (paying(np.inf), NonFiniteError, "the reward is inf after step 3"),
-        # In the first episode, which is new whatever it is, and when novelty is estimated.
-        (observing([GOOD, *[GOOD + np.inf] * 99]), NonFiniteError, "an observation is inf"),
-        (observing([GOOD] * 80 + [GOOD + np.inf]), NonFiniteError, "curiosity bonus is nan"),
-        (observing([GOOD] * 80 + [GOOD + np.nan]), NonFiniteError, "curiosity bonus is nan"),
+        (
+            paying(-1.7e308),
+            NonFiniteError,
+            r"reward is -1.7e\+308 after step 3, but float32 learns",
+        ),
+        (
+            paying(None),
+            ConfigError,
+            "gave None as reward after step 3, but it should be one number",
+        ),
+        (
+            observing([GOOD, *[GOOD + np.inf] * 99]),
+            NonFiniteError,
+            "observation is inf after step 1",
+        ),
+        (observing([[1e200] * 4]), NonFiniteError, r"observation is 1e\+200 after the reset, but"),
     ],
 )
 def test_what_goes_wrong_stops_it(env, error, message):

@@ -10,13 +10,13 @@ differ from version to version, and most of it is compressed already.
 import argparse
 import hashlib
 import io
-import subprocess
 import sys
 import tarfile
 import tomllib
 from pathlib import Path
 
 from mace_rl.files import write_atomically
+from mace_rl.runs.provenance import GitError, git
 
 ROOT = Path(__file__).resolve().parent.parent
 SUMS = "SHA256SUMS"
@@ -24,14 +24,6 @@ SUMS = "SHA256SUMS"
 
 class DepositError(RuntimeError):
     """A tree that is not to be deposited; the message says why."""
-
-
-def git(repository: Path, *arguments: str) -> bytes:
-    """What git prints; `DepositError` with its reason if it fails."""
-    run = subprocess.run(["git", "-C", str(repository), *arguments], capture_output=True)
-    if run.returncode:
-        raise DepositError(" ".join(run.stderr.decode(errors="replace").split()))
-    return run.stdout
 
 
 def committed(repository: Path) -> dict[str, tuple[bytes, int, str]]:
@@ -80,7 +72,7 @@ def main() -> None:
         name, data = deposit(ROOT)
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / name, data)
-    except (DepositError, OSError) as error:
+    except (DepositError, GitError, OSError) as error:
         sys.exit(f"deposit: {error}")
     print(f"{hashlib.sha256(data).hexdigest()}  {folder / name}")
 

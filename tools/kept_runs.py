@@ -152,6 +152,16 @@ def pack(results: Path, archives: Path) -> int:
     return count
 
 
+def _put(folder: Path, content: dict[str, bytes]) -> None:
+    """Write files below `folder`; `ValueError` if another one is there."""
+    for name, data in content.items():
+        if (folder / name).exists() and (folder / name).read_bytes() != data:
+            raise ValueError(f"{folder / name}: there already, and not the kept one")
+    for name, data in content.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)  # half of it would not be what run.json describes
+
+
 def unpack(archives: Path, results: Path) -> int:
     """Put the runs in `archives` where they were below `results`; returns how many.
 
@@ -161,9 +171,7 @@ def unpack(archives: Path, results: Path) -> int:
     def put_back(archive: Path) -> int:
         variant = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
         content = read(archive)
-        for name, data in content.items():
-            (variant / name).parent.mkdir(parents=True, exist_ok=True)
-            (variant / name).write_bytes(data)  # half of it would not be what run.json describes
+        _put(variant, content)
         return sum(name.endswith(files.RECORD) for name in content)
 
     packed = sorted(archives.glob("*/*.tar.xz"))
@@ -187,10 +195,8 @@ def unpack_sample(archives: Path, results: Path, count: int) -> int:
         run = draws.choice([name for name in content if name.endswith(files.RECORD)])
         if json.loads(content[run])["seconds"] < LONGEST:
             folder = results / "runs" / archive.parent.name / archive.name.partition(".tar")[0]
-            folder /= Path(run).parent
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in (run, run.replace(files.RECORD, files.EPISODES)):
-                (folder / Path(name).name).write_bytes(content[name])
+            names = (run, run.replace(files.RECORD, files.EPISODES))
+            _put(folder, {name: content[name] for name in names})
             left -= 1
     if left:
         raise ValueError(f"{archives}: {count - left} runs in it that take less than {LONGEST} s")

@@ -9,6 +9,7 @@ config.yaml, and the files CONFIG read over it, set for it.
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -39,11 +40,10 @@ def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
 
     `ConfigError` if the environment cannot be made with these arguments.
     """
+    arguments: dict[str, Any] = config.environment_arguments
     try:
         env = gymnasium.make(
-            config.environment,
-            max_episode_steps=config.max_episode_steps,
-            **config.environment_arguments,
+            config.environment, max_episode_steps=config.max_episode_steps, **arguments
         )
     except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())

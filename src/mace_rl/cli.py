@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mace_rl import files
+from mace_rl import files, outlets
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.library import settings
@@ -61,6 +61,11 @@ def parser() -> argparse.ArgumentParser:
         help="of every network: compiled (default) or plain PyTorch, slower, to check it by",
     )
     add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
+    add(
+        "--restart",
+        action="store_true",
+        help="move a run that is in the folder into a folder below it, and train from the start",
+    )
     add = command(
         "status",
         "print how far the workflow's runs are, and about when they will be done",
@@ -118,7 +123,7 @@ def parser() -> argparse.ArgumentParser:
         "repeat kept runs and compare to the bit",
         "reference --sample 1",
     )
-    add("folder", type=Path, help="with runs/ENV/VARIANT/seedN in it")
+    add("folder", type=Path, help="of a run, or with runs below it")
     add("--sample", type=int, help="how many, always the same ones (default: all)")
     add("--trust", action="store_true", help="import code that run.json names")
     return top
@@ -150,14 +155,14 @@ def train(arguments: argparse.Namespace) -> None:
     config = run_config(arguments)
     default = Path("runs", folder_of(config.environment), config.variant, f"seed{config.seed}")
     out: Path = arguments.out or default
-    if finished(config, out):
+    if not arguments.restart and finished(config, out):
         (out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
         logger.info("%s holds this run already, finished", out)
         return
     from mace_rl.runs import progress, run  # PyTorch takes seconds, a mistake should not
 
     with progress.line(sys.stderr) as observe:
-        run.run(config, out, observe)
+        run.run(config, out, observe, aside="all" if arguments.restart else "nothing")
     logger.info("finished: %s", out / files.EPISODES)
 
 
@@ -198,6 +203,7 @@ def watch(arguments: argparse.Namespace) -> None:
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
     out: Path = arguments.out or arguments.folder / name
     _require(out.suffix == ".gif", "--out", str(out), "end in .gif")
+    files.require_ours(out, b"GIF8")
     _require_playable(arguments)
     from mace_rl.runs import watch
 
@@ -249,6 +255,7 @@ def verify(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
+    outlets.secure()
     arguments = parser().parse_args()
     commands = {
         "train": train,
@@ -271,10 +278,17 @@ def main() -> None:
             raise
         extra = "tensorboard" if arguments.command == "tensorboard" else "study"
         sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
+    except SystemExit as error:  # a module of the user's own, where it is imported or made
+        sys.exit(f"mace-rl: code of the environment or of a plugin ended the program: {error!r}")
     except KeyboardInterrupt:
-        resumes = arguments.command == "train"
-        logger.info("interrupted%s", "; the same command resumes it" if resumes else "")
+        resumes = "; the same command resumes it" if arguments.command == "train" else ""
+        without = ", without --restart" if getattr(arguments, "restart", False) else ""
+        logger.info("interrupted%s%s", resumes, without)
         sys.exit(130)
+    buffer = getattr(sys.stdout, "buffer", None)
+    unseen = getattr(getattr(buffer, "raw", None), "error", None)
+    if unseen and arguments.command != "train":  # which shows nothing but how far it is
+        sys.exit(f"mace-rl: standard output: {unseen.strerror}")
 
 
 if __name__ == "__main__":

@@ -5,11 +5,27 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mace_rl.agent.advantages import mean, variance
-from mace_rl.agent.ppo import Update
-from mace_rl.agent.products import dot
+from mace_rl.agent.learner import Update
 from mace_rl.experience import Experience
+from mace_rl.numerics.arrays import mean, variance
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.products import dot
 from mace_rl.runs.records import UpdateRecord
+
+
+def unseen(normaliser: RunningNormaliser) -> list[int]:
+    """The dimensions of observations whose differences were, or would be, lost.
+
+    They count as constant in `RunningNormaliser`, or are a few units in the last place of float32.
+    What varies by float64's rounding is constant, which is suspect of large numbers only.
+    """
+    size = abs(normaliser.mean)
+    deviation = np.sqrt(normaliser.sum_of_squares / normaliser.count)
+    varies = deviation > 1e-12 * size
+    few_units = deviation < size * 2.0**-22
+    tiny = varies & ~few_units & (deviation <= 1e-8)
+    offset = few_units & (size > np.where(varies, 1e3, 2.0**24))
+    return np.flatnonzero(tiny | offset).tolist()
 
 
 def diagnose(

@@ -1,13 +1,17 @@
 """The parts of a run, made as its settings ask for: what sets β, the bonus, PPO."""
 
-import numpy as np
-from gymnasium.spaces import Discrete
+from collections.abc import Callable
+from typing import Any
 
-from mace_rl.agent.dictionary_critic import DictionaryCritic
-from mace_rl.agent.network import Network, network
-from mace_rl.agent.normaliser import RunningNormaliser
+import numpy as np
+import torch
+
+from mace_rl.agent.compiled_learner import CompiledLearner
+from mace_rl.agent.custom import custom_module
+from mace_rl.agent.learner import Learner
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import PPO, Critic, NetworkCritic
+from mace_rl.agent.ppo import PPO
+from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.controls import RandomDraw, SlidingWindowBandit
 from mace_rl.beta.meta import MetaAdaptation
@@ -17,7 +21,7 @@ from mace_rl.bonus.hashing import HashCounts
 from mace_rl.bonus.icm import IntrinsicCuriosityModule
 from mace_rl.bonus.intrinsic import IntrinsicReward
 from mace_rl.bonus.rnd import RandomNetworkDistillation
-from mace_rl.config.agent import DictionaryValue
+from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.beta import (
     BanditBeta,
     BetaRule,
@@ -32,6 +36,8 @@ from mace_rl.config.bonus import CuriosityBonus, CustomBonus, HashCountsBonus, I
 from mace_rl.config.plugins import make
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
+from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
+from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.streams import Streams
 
 
@@ -43,10 +49,8 @@ def beta_controller(
         case NoBonus():
             return None
         case MetaBeta(initial=initial):
-            size, actions = environment.observation_size, environment.action_space
-            generator = streams["meta"]
             assert config.meta is not None  # what a variant uses is there: `RunConfig`
-            return MetaAdaptation(config.meta, initial, config.engine, size, actions, generator)
+            return MetaAdaptation(config.meta, initial, environment, streams["meta"])
         case rule:
             return beta_rule(rule, config.ppo.rollout_steps, streams["beta"])
 
@@ -73,18 +77,17 @@ def intrinsic_reward(
 ) -> IntrinsicReward | None:
     """What β weighs: the curiosity bonus with its memory and novelty, or another; None in PPO."""
     space, size = environment.observation_space, environment.observation_size
-    actions, generator, engine = environment.action_space, streams["bonus"], config.engine
+    actions, generator = environment.action_space, streams["bonus"]
     match config.bonus:
         case None:
             return None
         case CuriosityBonus():
             assert config.novelty is not None  # as above
-            return Curiosity(config.memory, config.novelty, engine, space, size, streams)
+            return Curiosity(config.memory, config.novelty, space, size, streams)
         case ICMBonus():
-            of = config.bonus, engine, space, actions, size, generator
-            return IntrinsicCuriosityModule(*of)
+            return IntrinsicCuriosityModule(config.bonus, space, actions, size, generator)
         case RNDBonus():
-            return RandomNetworkDistillation(config.bonus, engine, space, size, generator)
+            return RandomNetworkDistillation(config.bonus, space, size, generator)
         case HashCountsBonus():
             return HashCounts(config.bonus, space, size, generator)
         case CustomBonus(estimator=estimator, arguments=arguments):
@@ -93,24 +96,25 @@ def intrinsic_reward(
 
 
 def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:
-    """Policy and critics, one for each kind of reward."""
-    space, size = environment.action_space, environment.observation_size
+    """Policy and critics, one for each kind of reward, and what trains them."""
+    settings, size = config.ppo, environment.observation_size
+    own = settings.network if isinstance(settings.network, TorchModule) else None
 
-    def new(outputs: int, output_gain: float, stream: str) -> Network:
-        return network(config.ppo, config.engine, size, outputs, output_gain, streams[stream])
+    def module(outputs: int, output_gain: float, stream: str) -> torch.nn.Module:
+        generator = streams[stream]
+        if own is not None:
+            return custom_module(own, settings.hidden_units, size, outputs, generator)
+        return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
 
-    actions = int(space.n) if isinstance(space, Discrete) else space.shape[0]
+    network: Callable[[Any], Any] = CompiledMLP
+    learner: Callable[[PPOConfig, Policy, Any], Learner] = CompiledLearner
+    if own is not None or config.engine == "torch":
+        network, learner = TorchNetwork, TorchLearner
     # A small last layer starts near the uniform policy, or at means near 0.
-    policy = Policy(new(actions, 0.01, "actor"), space, config.ppo.initial_log_std)
+    actor = network(module(environment.action_size, 0.01, "actor"))
+    policy = Policy(actor, environment.action_space, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
-    normaliser = RunningNormaliser(size)
-
-    def critic(kind: str) -> Critic:
-        settings = config.ppo.critic
-        if isinstance(settings, DictionaryValue):
-            normalised = config.ppo.normalise_observations
-            return DictionaryCritic(kind, settings, normaliser, normalised)
-        return NetworkCritic(kind, new(1, 1.0, f"{kind}_critic"), config.ppo)
-
-    critics = {kind: critic(kind) for kind in kinds}
-    return PPO(config.ppo, policy, critics, normaliser, streams["minibatches"])
+    critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
+    normaliser, generator = RunningNormaliser(size), streams["minibatches"]
+    trained = learner(settings, policy, critics)
+    return PPO(settings, policy, critics, trained, normaliser, generator)

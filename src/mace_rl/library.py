@@ -64,6 +64,7 @@ def train(
     settings: RunConfig,
     callback: Callable[[EpisodeRecord], object] | None = None,
     folder: str | Path | None = None,
+    restart: bool = False,
 ) -> Trained:
     """Train to the last episode, in this process and on one thread.
 
@@ -71,15 +72,16 @@ def train(
     callback: is called with each episode after the update that it was played for.
     folder: keeps the run, as `mace-rl train --out` does: the same call goes on with what was
         interrupted, without calling back for its episodes again, and only reads what is finished.
+    restart: move a run that is in `folder` into a folder below it, and train from the start.
 
-    Raises `ConfigError` if `folder` has the results of another run, and `NonFiniteError` as soon as
-    a number goes bad.
+    Raises `ConfigError` if `folder` has the results of another run, `RunError` if it has another
+    run unfinished or files of nobody's, and `NonFiniteError` as soon as a number goes bad.
     """
     from mace_rl.runs.agent import load_agent  # torch takes seconds
     from mace_rl.runs.run import run
 
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(folder or scratch)
-        if not finished(settings, directory):
-            run(settings, directory, after_episode=callback)
+        if restart or not finished(settings, directory):
+            run(settings, directory, None, False, callback, "all" if restart else "nothing")
         return Trained(load_agent(directory, trust=True), read_rows(directory / files.EPISODES))

@@ -9,23 +9,19 @@ rooms `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta
 `environments`; `factories` makes it as the settings ask for.
 """
 
+import logging
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import (
-    mean,
-    normalised,
-    normalised_change,
-    root_mean_square,
-    total,
-)
-from mace_rl.agent.ppo import Batch, Update
+from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.learner import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
-from mace_rl.diagnostics import diagnose
+from mace_rl.diagnostics import diagnose, unseen
+from mace_rl.environments import resuming
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
 from mace_rl.experience import (
@@ -36,9 +32,13 @@ from mace_rl.experience import (
     total_advantages,
 )
 from mace_rl.factories import beta_controller, intrinsic_reward, ppo
-from mace_rl.finite import NonFiniteError, require_finite, require_share
+from mace_rl.numerics.arrays import mean, root_mean_square, total
+from mace_rl.numerics.finite import TOO_LARGE, require_finite, require_within
+from mace_rl.refusal import Refusal
 from mace_rl.runs.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
+
+logger = logging.getLogger(__name__)
 
 
 class Trainer:
@@ -60,6 +60,7 @@ class Trainer:
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
+        self.last_episodes = resuming.LastEpisodes()
 
     def run(self) -> Iterator[list[EpisodeRecord]]:
         """Train to the last episode; yields the records of each round after its update.
@@ -76,14 +77,16 @@ class Trainer:
                 update = self.improve(rollout)
                 done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
                 self.diagnostics.append(diagnose(done, rollout, update, credit))
-            except Exception as error:
+            except (Exception, SystemExit, GeneratorExit) as error:
                 run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
                 played = len(self.records)
                 where = (
                     f"the update after episode {played}" if updating else f"episode {played + 1}"
                 )
-                if isinstance(error, NonFiniteError):
-                    raise NonFiniteError(f"{run}, {where}: {error}") from None
+                if isinstance(error, Refusal):
+                    raise type(error)(f"{run}, {where}: {error}") from error.__cause__
+                if not isinstance(error, Exception):
+                    raise Refusal(f"{run}, {where}: code raised {error!r}") from error
                 error.add_note(f"in {run}, {where}")
                 raise
             yield self.records[start:]
@@ -96,7 +99,9 @@ class Trainer:
         wanted = self.config.ppo.rollout_steps
         while collected < wanted and len(self.records) < self.config.episodes:
             noise = draw_noise(self.environment, self.noise)
+            self.last_episodes.begin(self.environment)
             episode = self.play(self.environment, policy, noise)
+            self.last_episodes.end(episode)
             rollout.append(self.appraise(episode))
             collected += len(episode)
         return rollout
@@ -104,17 +109,24 @@ class Trainer:
     def appraise(self, episode: Episode) -> Experience:
         """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
         observations = self.ppo.normalise(episode.observations)
+        unit = self.ppo.unit("extrinsic")
         extrinsic_advantages, extrinsic_returns = self.ppo.advantages_and_returns(
             "extrinsic", observations, episode.rewards, episode.terminated
         )
+        if self.records and self.ppo.unit("extrinsic") > 1e6 * unit:
+            logger.warning(
+                "%s: the rewards of episode %d are so large that others now count for a millionth",
+                *(self.config.environment, len(self.records) + 1),
+            )
         beta, bonus, intrinsic_scale = 0.0, None, 1.0
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta = self.controller.beta
-            require_share("β", beta)
+            require_within("β", beta)
             bonus = self.curiosity.bonus(episode)
             reward = bonus.reward
-            require_share("the curiosity bonus", reward, 1e-6, self.curiosity.largest)
+            largest = min(self.curiosity.largest, TOO_LARGE)
+            require_within("the curiosity bonus", reward, 1e-6, largest)
             reward = np.maximum(reward, 0.0)
             intrinsic_advantages, intrinsic_returns = self.ppo.advantages_and_returns(
                 "intrinsic", observations, reward, episode.terminated
@@ -162,10 +174,10 @@ class Trainer:
             extrinsic -= mean(extrinsic)
         total = total_advantages(rollout)
         changes = [normalised_change(total, part, centred) for part in intrinsic_parts(rollout)]
-        gradient, *changes = self.ppo.policy_gradients(*steps(rollout), [extrinsic, *changes])
-        adam = self.ppo.optimisers["actor"]
+        learner = self.ppo.learner
+        gradient, *changes = learner.policy_gradients(*steps(rollout), [extrinsic, *changes])
         effects = [
-            Effect(adam.preconditioned(change), root_mean_square(item.intrinsic_part))
+            Effect(learner.preconditioned(change), root_mean_square(item.intrinsic_part))
             for change, item in zip(changes, rollout, strict=True)
         ]
         return self.controller.learn(gradient, root_mean_square(extrinsic), effects)
@@ -181,16 +193,22 @@ class Trainer:
                 *steps(rollout),
                 log_probs=joined([item.episode.log_probs for item in rollout]),
                 advantages=advantages.astype(np.float32),
-                returns=returns,
-            )
+            ),
+            returns,
         )
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
-        for name, adam in self.ppo.optimisers.items():
-            require_finite(f"a weight of the {name}", adam.parameters)
+        for name, parameters in self.ppo.learner.parameters.items():
+            require_finite(f"a weight of the {name}", parameters)
         for item in rollout:
             self.ppo.normaliser.update(item.episode.observations[:-1])
+        if not self.diagnostics and (dimensions := unseen(self.ppo.normaliser)):
+            logger.warning(
+                "%s: differences in observation%s are below 1e-8, or below what float32 tells "
+                "apart, and are not learned from: use a smaller unit, or leave an offset out",
+                *(self.config.environment, dimensions),
+            )
         return update
 
     def state_dict(self) -> dict[str, Any]:
@@ -200,7 +218,8 @@ class Trainer:
             "curiosity": self.curiosity.state_dict() if self.curiosity is not None else None,
             "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
-            "environment": self.environment.generator.bit_generator.state,
+            "environment": resuming.state_of(self.environment),
+            "last_episodes": self.last_episodes.blocks,
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
             "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }
@@ -212,7 +231,8 @@ class Trainer:
             self.curiosity.load_state_dict(state["curiosity"])
             self.controller.load_state_dict(state["controller"])
         self.noise.bit_generator.state = state["noise"]
-        self.environment.generator.bit_generator.state = state["environment"]
+        resuming.set_state(self.environment, state["environment"])
+        self.last_episodes.blocks = state["last_episodes"]
         self.records = as_rows(EpisodeRecord, state["records"])
         self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
 

@@ -23,15 +23,15 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from mace_rl.appraisal import PARTS, Appraisal
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
+from mace_rl.curiosity_tracker import PARTS, CuriosityTracker
 from mace_rl.environments.spaces import Spaces
 
 Settings = Mapping[str, Any]
 
 
-class Curious(RecordConstructorArgs):
+class CuriosityMixin(RecordConstructorArgs):
     """What both wrappers have; `CuriosityReward` says what the arguments mean."""
 
     def __init__(
@@ -59,7 +59,7 @@ class Curious(RecordConstructorArgs):
                     f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
                     " but it should be one of gymnasium.vector.AutoresetMode"
                 )
-        self.appraisal = Appraisal(config, Spaces(name_of(env), *spaces), count)
+        self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
 
     def state_dict(self) -> dict[str, Any]:
         """All that the rest of a training depends on here, unfinished episode included.
@@ -67,14 +67,14 @@ class Curious(RecordConstructorArgs):
         Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
         `weights_only`. The environment's and the agent's state are not in it.
         """
-        return self.appraisal.state_dict()
+        return self.tracker.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned; `ConfigError` if other settings made it."""
-        self.appraisal.load_state_dict(state)
+        self.tracker.load_state_dict(state)
 
 
-class CuriosityReward(Curious, gymnasium.Wrapper[Any, Any, Any, Any]):
+class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
     env: observations are arrays of one shape (Box; they are flattened) or Discrete, actions are
@@ -106,21 +106,21 @@ class CuriosityReward(Curious, gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """The environment's reset."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self.appraisal.begin(0, observation)
+        self.tracker.begin(0, observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        parts = self.appraisal.pay(0, action, float(reward), observation)
+        parts = self.tracker.reward_parts(0, action, reward, observation)
         if terminated or truncated:
-            self.appraisal.end(0, bool(terminated))
+            self.tracker.end(0, bool(terminated))
         total = parts["reward_extrinsic"] + parts["reward_curiosity"]
-        return observation, total, terminated, truncated, {**info, **parts}
+        return observation, total, terminated, truncated, {**(info or {}), **parts}
 
 
 # Gymnasium's class takes no types as arguments before its version 1.3.
-class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper):
+class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
     """`CuriosityReward` for environments that are stepped together and share what is known.
 
     What was seen in one of them is known in all as soon as its episode has ended. Arguments are
@@ -136,7 +136,7 @@ class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper):
         chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
         observations, infos = self.env.reset(seed=seed, options=options)
         for i in np.flatnonzero(chosen).tolist():
-            self.appraisal.begin(i, observations[i])
+            self.tracker.begin(i, observations[i])
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -147,16 +147,16 @@ class VectorCuriosityReward(Curious, gymnasium.vector.VectorWrapper):
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
             final = infos["final_obs"]
             reached = [final[i] if ended[i] else observations[i] for i in range(self.num_envs)]
-        over = np.array([recording is None for recording in self.appraisal.recordings])
+        over = np.array([recording is None for recording in self.tracker.recordings])
         fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
         values = np.zeros((len(PARTS), self.num_envs))
         for i in np.flatnonzero(~fresh).tolist():
-            parts = self.appraisal.pay(i, actions[i], float(rewards[i]), reached[i])
+            parts = self.tracker.reward_parts(i, actions[i], rewards[i], reached[i])
             values[:, i] = list(parts.values())
         for i in np.flatnonzero(ended).tolist():
-            self.appraisal.end(i, bool(terminated[i]))
+            self.tracker.end(i, bool(terminated[i]))
         for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
-            self.appraisal.begin(i, observations[i])
+            self.tracker.begin(i, observations[i])
         total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
         told = dict(zip(PARTS, values, strict=True))
         masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)

@@ -54,9 +54,43 @@ def in_short(record):
         last = [line for log in logs for line in log.read_text(errors="replace").splitlines()[-1:]]
         said = [record.rule_msg, *(f"its log ends: {line}" for line in last)]
         record.rule_msg = "; ".join(filter(None, said)) or "it has no log"
+    elif str(record.msg).startswith(LAST) and workflow.is_main_process and not workflow.dryrun:
+        record.msg = f"{record.msg}\n{outcome()}"
     return True
 
 
+def outcome():
+    """Table 1, if it is among what was asked for, and where all of this lies."""
+    made = {str(path) for job in workflow.dag.jobs for path in job.output}
+    asked = {str(path) for job in workflow.dag.targetjobs for path in job.output}
+    lines = []
+    if f"{RESULTS}/table1.csv" in made:
+        import pandas  # only now: it takes as long as planning
+
+        from mace_rl.study.show import markdown, tables
+
+        names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
+        data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
+        table = tables.table1(tables.named(data, study.labels), MEASURED, paper.table1)
+        lines = [f"\n{title()}\n", markdown.plain(table), ""]
+    lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
+    lines += textwrap.wrap(", ".join([*lie, *sorted(asked.difference(lie))]), 100)
+    if f"{RESULTS}/tables.md" in made and f"{RESULTS}/report.html" not in made:
+        lines.append(f"All of it on one page: {COMMAND.replace('all', 'page', 1)}")
+    return "\n".join(lines)
+
+
+def title():
+    from mace_rl.study.show.tables import counts_episodes
+
+    name = f"Table 1: {paper.table1.caption[0].lower()}{paper.table1.caption[1:]}"
+    if not counts_episodes(MEASURED, paper.table1):
+        return f"{name}; *: best"
+    return f"{name} in episodes; *: lowest; †k: k seeds never get there"
+
+
+SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
+LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
 
 
@@ -86,6 +120,8 @@ onstart:
 
 
 onsuccess:
+    global LAST
+    LAST += ("Elapsed time: ",)
     for folder in {Path(episodes).parent for episodes in EPISODES}:
         # Not of an unfinished run, which was not asked for this time.
         if (folder / files.RECORD).exists():

@@ -8,6 +8,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from mace_rl import outlets
 
 PATIENCE = 1.0  # seconds between looks at whether Snakemake is alive
 
@@ -25,6 +28,7 @@ def job(title: str, log: str) -> Iterator[None]:
     # Without this a training goes on unseen when Snakemake is killed.
     if "MACE_RL_SNAKEMAKE_PID" in os.environ:
         threading.Thread(target=_end_with_snakemake, daemon=True).start()
+    outlets.secure()  # or the log gets the number of one that is closed
     with open(log, "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -43,7 +47,7 @@ def job(title: str, log: str) -> Iterator[None]:
     start = time.monotonic()
     try:
         yield
-    except Exception as error:
+    except BaseException as error:  # sys.exit(0) of an environment, too, is no success
         logger.exception("%s failed", title)
         said = "; ".join([str(error), *getattr(error, "__notes__", ())])
         reason = f"{type(error).__name__}: {' '.join(said.split())}"
@@ -54,10 +58,16 @@ def job(title: str, log: str) -> Iterator[None]:
 
 def _end_with_snakemake() -> None:
     pid = int(os.environ["MACE_RL_SNAKEMAKE_PID"])
-    while True:
+    while _lives(pid):
         time.sleep(PATIENCE)
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            logger.info("Snakemake (process %d) is gone, so this job ends", pid)
-            os._exit(1)
+    logger.info("Snakemake (process %d) is gone, so this job ends", pid)
+    os._exit(1)
+
+
+def _lives(pid: int) -> bool:
+    """Not if it was killed and nobody asks how it ended, as in a container without an init."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state not in "XZ"

@@ -14,4 +14,5 @@ with job(f"training {run_of.env}, {run_of.variant}, seed {run_of.seed}", snakema
         RunConfig.model_validate(snakemake.params.config),
         Path(snakemake.output.episodes).parent,
         keep_checkpoint="MACE_RL_KEEP_CHECKPOINTS" in os.environ,
+        aside="others",  # Snakemake knows that it is to be trained anew, and nobody is asked
     )

@@ -1,11 +1,10 @@
 """Advantages: how much better an action was than the policy's average."""
 
-import math
-
 import numpy as np
 
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.products import dot
+from mace_rl.numerics.arrays import mean, root_mean_square
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.products import dot
 
 
 @kernel
@@ -51,33 +50,3 @@ def normalised_change(advantages: np.ndarray, change: np.ndarray, centred: bool)
     spread = root_mean_square(advantages) + 1e-8
     direction = advantages / spread
     return (change - direction * (dot(direction, change) / len(change))) / spread
-
-
-@kernel
-def root_mean_square(values: np.ndarray) -> float:
-    """√(Σ x² / N)."""
-    return math.sqrt(dot(values, values) / len(values))
-
-
-@kernel
-def total(values: np.ndarray) -> float:
-    """Σ x of float64 [N], in order."""
-    result = 0.0
-    for value in values:
-        result += value
-    return result
-
-
-@kernel
-def mean(values: np.ndarray) -> float:
-    """Σ x / N."""
-    return total(values) / len(values)
-
-
-@kernel
-def variance(values: np.ndarray) -> float:
-    """Mean squared deviation from the mean of float64 [N]."""
-    centre, squares = mean(values), 0.0
-    for value in values:
-        squares += (value - centre) ** 2
-    return squares / len(values)

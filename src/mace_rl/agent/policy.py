@@ -1,64 +1,18 @@
-"""The policy π(a|s): a distribution over actions on the outputs of a network."""
+"""The policy π(a|s), a distribution over actions on the outputs of a network; acting with it."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent import kernels
-from mace_rl.agent.network import CompiledMLP, Network, Trace
+from mace_rl.agent.distribution import log_probs, sample_categorical, sample_gaussian
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.network import CompiledMLP, Network
+from mace_rl.numerics.network_kernels import activation_buffer, forward
+from mace_rl.numerics.normaliser import Normalisation, normalise
 
 Action = int | np.ndarray  # from 0, or float32 [actions] before clipping to the bounds
-
-
-class ActingPolicy(Protocol):
-    """What a rollout needs of the policy, with observation normalisation in front of it."""
-
-    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """An action for one observation, float32 [observation], and its log-probability.
-
-        noise: uniform in [0, 1) for Discrete actions, else standard normal, [actions].
-        """
-
-
-class CompiledActing(NamedTuple):
-    """Acting with a compiled network: plain arrays, for compiled rollouts too."""
-
-    mean: np.ndarray  # float32 [observation], subtracted from observations
-    inverse_std: np.ndarray  # float32 [observation]
-    clip: np.float32  # bound of normalised observations
-    parameters: np.ndarray  # float32, see kernels
-    sizes: np.ndarray  # int64 [layers + 1]
-    log_std: np.ndarray  # float32 [actions]; empty for Discrete actions
-    seen: np.ndarray  # overwritten, like the next, see kernels.act_discrete
-    activations: np.ndarray
-
-    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
-        sample = kernels.act_box if len(self.log_std) else kernels.act_discrete
-        return sample(observation, self, noise)
-
-
-@dataclass(frozen=True)
-class NetworkActing:
-    """Acting with any network."""
-
-    policy: "Policy"
-    mean: np.ndarray  # float32 [observation]
-    inverse_std: np.ndarray  # float32 [observation]
-    clip: np.float32
-
-    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
-        seen = np.empty_like(self.mean)
-        kernels.normalise(observation, self.mean, self.inverse_std, self.clip, seen)
-        with torch.no_grad():
-            outputs = self.policy.network.forward(seen[None]).outputs[0]
-        if self.policy.discrete:
-            return kernels.sample_categorical(outputs, noise)
-        return kernels.sample_gaussian(outputs, self.policy.log_std, noise)
 
 
 class Policy:
@@ -80,53 +34,86 @@ class Policy:
         network.move_to(self.parameters[:count])
         self.log_std = self.parameters[count:]  # float32 [actions]; empty for Discrete actions
 
-    def forward(self, observations: np.ndarray) -> Trace:
-        """The network's outputs for normalised observations, [N, observation]."""
-        return self.network.forward(observations)
-
     def log_probs(self, outputs: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """log π(a|s), [N], from the network's outputs, [N, out], and actions.
+        """log π(a|s), float32 [N]; outputs: the network's, [N, out]; actions: as in `Batch`."""
+        return log_probs(outputs, self.log_std, actions)
 
-        actions: int64 [N] or float32 [N, actions].
+
+class ActingPolicy(Protocol):
+    """What a rollout needs of the policy, with observation normalisation in front of it.
+
+    Its weights follow later updates; the normalisation stays as it was when this was made.
+    """
+
+    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
+        """An action for one observation, float32 [observation], and its log-probability.
+
+        noise: uniform in [0, 1) for Discrete actions, else standard normal, [actions].
         """
-        result = np.empty(len(outputs), np.float32)
-        kernels.log_probs(outputs, self.log_std, actions, result)
-        return result
 
-    def gradient(
-        self,
-        trace: Trace,
-        actions: np.ndarray,
-        weights: np.ndarray,
-        entropy_weight: float = 0.0,
-        sums: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """∇_θ Σ_t (w_t log π(a_t|s_t) + entropy_weight · H(π(·|s_t))), float32 [n].
 
-        trace: from `forward`; actions: as in `log_probs`; weights: float32 [N]. To sums[2] the
-        entropies are added.
-        """
-        sums = np.zeros(3) if sums is None else sums
-        grad_outputs, gradient = np.empty_like(trace.outputs), np.zeros_like(self.parameters)
-        count = len(gradient) - len(self.log_std)
-        kernels.log_prob_gradient(
-            *(trace.outputs, self.log_std, actions, weights, entropy_weight),
-            *(grad_outputs, gradient[count:], sums),
-        )
-        gradient[:count] = self.network.backward(trace, grad_outputs)
-        return gradient
+@dataclass(frozen=True)
+class NetworkActing:
+    """Acting with any network."""
 
-    def for_acting(self, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:
-        """The policy with observation normalisation in front of it.
+    policy: Policy
+    normalisation: Normalisation
 
-        Its weights follow later updates; `mean` and `std` stay as they are now.
-        """
-        normalisation = mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip)
-        if not isinstance(self.network, CompiledMLP):
-            return NetworkActing(self, *normalisation)
-        sizes = self.network.sizes
-        return CompiledActing(
-            *(*normalisation, self.network.parameters, sizes, self.log_std),
-            np.empty((1, sizes[0]), np.float32),
-            kernels.room_for(1, sizes),
-        )
+    def outputs(self, observation: np.ndarray) -> np.ndarray:
+        """The network's for one observation, [1, out]."""
+        seen = np.empty_like(self.normalisation.mean)
+        normalise(observation, self.normalisation, seen)
+        return self.policy.network.outputs(seen[None])
+
+    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
+        """See `ActingPolicy`."""
+        outputs = self.outputs(observation)[0]
+        if self.policy.discrete:
+            return sample_categorical(outputs, noise)
+        return sample_gaussian(outputs, self.policy.log_std, noise)
+
+
+class CompiledActing(NamedTuple):
+    """Acting with a compiled network: plain arrays, for compiled rollouts too."""
+
+    normalisation: Normalisation
+    parameters: np.ndarray  # float32, see `network_kernels`
+    sizes: np.ndarray  # int64 [layers + 1]
+    log_std: np.ndarray  # float32 [actions]; empty for Discrete actions
+    seen: np.ndarray  # overwritten, like the next, see `means_or_logits`
+    activations: np.ndarray
+
+    @classmethod
+    def of(
+        cls, network: CompiledMLP, log_std: np.ndarray, normalisation: Normalisation
+    ) -> "CompiledActing":
+        """Acting with this network."""
+        sizes = network.sizes
+        seen = np.empty((1, sizes[0]), np.float32)
+        buffer = activation_buffer(1, sizes)
+        return cls(normalisation, network.parameters, sizes, log_std, seen, buffer)
+
+    def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
+        """See `ActingPolicy`."""
+        sample = act_box if len(self.log_std) else act_discrete
+        return sample(observation, self, noise)
+
+
+@kernel
+def means_or_logits(observation, policy):
+    """The network's outputs for one observation, not yet normalised; policy: `CompiledActing`."""
+    normalise(observation, policy.normalisation, policy.seen[0])
+    outputs = forward(policy.seen, policy.parameters, policy.sizes, policy.activations)
+    return outputs[0, : policy.sizes[-1]]
+
+
+@kernel
+def act_discrete(observation, policy, uniform):
+    """`sample_categorical` from the network's logits for one observation."""
+    return sample_categorical(means_or_logits(observation, policy), uniform)
+
+
+@kernel
+def act_box(observation, policy, normal):
+    """`sample_gaussian` around the network's means for one observation."""
+    return sample_gaussian(means_or_logits(observation, policy), policy.log_std, normal)

@@ -1,21 +1,23 @@
 """Running scales, which make rewards and advantages of different tasks comparable."""
 
 import math
-from typing import Any
 
 import numpy as np
 
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.agent.products import dot
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.products import dot
+from mace_rl.state import Stateful
 
 
-class RewardScale:
+class RewardScale(Stateful):
     """What rewards are divided by: the standard deviation of their discounted sums so far.
 
     The sum at a step is r_t + γ r_{t-1} + γ² r_{t-2} + … within its episode (as in the code of
     Schulman et al. 2017; Engstrom et al. 2020), and the scale is never below `smallest`.
     """
+
+    STATE = ("sums",)
 
     def __init__(self, discount: float, smallest: float) -> None:
         self.discount, self.smallest = discount, smallest
@@ -30,20 +32,14 @@ class RewardScale:
         """The scale; at least `smallest`."""
         return max(float(self.sums.std[0]), self.smallest)  # 1 while the sums have not varied
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        return self.sums.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self.sums.load_state_dict(state)
-
-
-class AdvantageScale:
+class AdvantageScale(Stateful):
     """What advantages are divided by: their root mean square so far, at least `smallest`.
 
     It comes down slowly when advantages do, so that what fades in a task fades here.
     """
+
+    STATE = ("count", "squares")
 
     def __init__(self, smallest: float) -> None:
         self.smallest = smallest
@@ -58,14 +54,6 @@ class AdvantageScale:
     def value(self) -> float:
         """The scale; at least `smallest`."""
         return max(math.sqrt(self.squares / max(self.count, 1)), self.smallest)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        return {"count": self.count, "squares": self.squares}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self.count, self.squares = state["count"], state["squares"]
 
 
 @kernel

@@ -12,7 +12,7 @@ class Effect(NamedTuple):
     """What the β of one episode changes in the update on it."""
 
     direction: np.ndarray  # dθ'/dβ as the optimiser steps, up to a factor, float32 [n]
-    influence: float  # RMS of what β weighs: the episode's intrinsic advantages, in their scale
+    advantage_rms: float  # of what β weighs: the episode's intrinsic advantages, in their scale
 
 
 class BetaController(ABC):

@@ -2,18 +2,20 @@
 
 import math
 from collections import deque
-from typing import Any
 
 import numpy as np
 
-from mace_rl.agent.advantages import total
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.beta import BanditBeta, RandomBeta
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.arrays import total
+from mace_rl.state import Stateful
 
 
-class RandomDraw(BetaController):
+class RandomDraw(Stateful, BetaController):
     """β uniform in [low, high), drawn anew for every episode."""
+
+    STATE = ("_beta", "generator")
 
     def __init__(self, config: RandomBeta, generator: np.random.Generator) -> None:
         self.config, self.generator = config, generator
@@ -32,17 +34,8 @@ class RandomDraw(BetaController):
         """See `BetaController`."""
         self._beta = self.draw()
 
-    def state_dict(self) -> dict[str, Any]:
-        """See `BetaController`."""
-        return {"beta": self._beta, "generator": self.generator.bit_generator.state}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `BetaController`."""
-        self._beta = state["beta"]
-        self.generator.bit_generator.state = state["generator"]
-
-
-class SlidingWindowBandit(BetaController):
+class SlidingWindowBandit(Stateful, BetaController):
     """β by Agent57's bandit: sliding-window UCB with ε-greedy (Badia et al. 2020, appendix D).
 
     Each arm a is a β. Every arm is pulled once, in order; then, with N(a) the pulls of an arm among
@@ -55,6 +48,8 @@ class SlidingWindowBandit(BetaController):
     the next rollout's episodes return, on average. Returns count from the worst, 0, to the best, 1,
     of all episodes so far, so that `exploration` means the same in every task.
     """
+
+    STATE = ("arm", "pulls", "unpaid", "paid", "worst", "best", "returns", "steps", "generator")
 
     def __init__(
         self, config: BanditBeta, rollout_steps: int, generator: np.random.Generator
@@ -103,19 +98,3 @@ class SlidingWindowBandit(BetaController):
         span = self.best - self.worst
         mean = (sum(found) / len(found) - self.worst) / span if span > 0 else 0.0
         return mean + self.config.exploration * math.sqrt(1 / len(found))
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `BetaController`."""
-        kept = ("arm", "pulls", "unpaid", "worst", "best", "steps")
-        return {name: getattr(self, name) for name in kept} | {
-            "returns": list(self.returns),
-            "paid": list(self.paid),
-            "generator": self.generator.bit_generator.state,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `BetaController`."""
-        self.generator.bit_generator.state = state["generator"]
-        self.returns, self.paid = list(state["returns"]), deque(state["paid"], self.config.window)
-        self.arm, self.pulls, self.unpaid = state["arm"], state["pulls"], state["unpaid"]
-        self.worst, self.best, self.steps = state["worst"], state["best"], state["steps"]

@@ -5,15 +5,16 @@ PyTorch's 32 short steps are nearly all call overhead.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mace_rl.agent.elementary import log, tanh
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.network import TorchNetwork, Trace
-from mace_rl.agent.products import LANES, add_product, dot, padded, product
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import log, sigmoid, tanh
+from mace_rl.numerics.network import Trace
+from mace_rl.numerics.products import LANES, add_product, dot, padded, product
 
 
 class MetaNetwork(torch.nn.Module):
@@ -52,53 +53,47 @@ def _parameter(values: np.ndarray) -> torch.nn.Parameter:
     return torch.nn.Parameter(torch.from_numpy(values.astype(np.float32)))
 
 
-class TorchMetaNetwork(TorchNetwork):
-    """`MetaNetwork` for several sequences, [T, in] each, one after the other."""
+class Weights(NamedTuple):
+    """Those of a `MetaNetwork` with H units, or like them; float32."""
 
-    def forward(self, inputs: list[np.ndarray]) -> Trace:  # type: ignore[override]
-        """See `Network`; the outputs are one logit for each sequence, [B]."""
-        outputs = torch.cat([self._module(torch.from_numpy(sequence)) for sequence in inputs])
-        return Trace(outputs.detach().numpy(), (outputs, inputs))
+    weight_ih: np.ndarray  # [in, 4 H]; columns: input, forget and output gate, candidate
+    weight_hh: np.ndarray  # [≤ H, 4 H]
+    bias: np.ndarray  # [4 H]
+    readout: np.ndarray  # [H]
+    readout_bias: np.ndarray  # [1]
+
+
+class States(NamedTuple):
+    """What the network computed for B sequences; float32."""
+
+    gates: np.ndarray  # [T, B, 4 H], as in `Weights`
+    cells: np.ndarray  # [T + 1, B, H], the zero state included, like the next
+    hidden: np.ndarray
 
 
 class CompiledMetaNetwork:
     """`MetaNetwork` in compiled code, for several sequences side by side.
 
     `parameters` are the module's, one kind after the other, with units added to a multiple of 16
-    (see `mace_rl.agent.kernels`): their weights are 0 and stay so.
+    (see `network_kernels`): their weights are 0 and stay so.
     """
-
-    parameters: np.ndarray  # float32 [n]
 
     def __init__(self, module: MetaNetwork) -> None:
         self.inputs, self.units = len(module.weight_ih), len(module.weight_hh)
         width = padded(self.units)
-        self.shapes = (
-            (self.inputs, 4 * width),
-            (self.units, 4 * width),
-            (4 * width,),
-            (width,),
-            (1,),
-        )
+        gates = 4 * width
+        self.shapes = (self.inputs, gates), (self.units, gates), (gates,), (width,), (1,)
         self.parameters = np.zeros(sum(math.prod(shape) for shape in self.shapes), np.float32)
-        self.views = self.split(self.parameters)
+        self.weights = self.split(self.parameters)
         self.load_module_state(module.state_dict())
 
-    def split(self, flat: np.ndarray) -> list[np.ndarray]:
+    def split(self, flat: np.ndarray) -> Weights:
         """Views of a vector like `parameters`: each kind of weights, units added."""
-        ends = np.cumsum([math.prod(shape) for shape in self.shapes])[:-1]
-        return [
-            part.reshape(shape)
-            for part, shape in zip(np.split(flat, ends), self.shapes, strict=True)
-        ]
-
-    def move_to(self, memory: np.ndarray) -> None:
-        """See `Network`."""
-        memory[:] = self.parameters
-        self.parameters, self.views = memory, self.split(memory)
+        parts = np.split(flat, np.cumsum([math.prod(shape) for shape in self.shapes])[:-1])
+        return Weights(*(part.reshape(n) for part, n in zip(parts, self.shapes, strict=True)))
 
     def forward(self, inputs: list[np.ndarray]) -> Trace:
-        """See `TorchMetaNetwork`."""
+        """The logit for each of several sequences, [T, in] each: outputs [B]."""
         lengths = np.array([len(sequence) for sequence in inputs])
         order = np.argsort(-lengths, kind="stable")
         lengths = lengths[order]
@@ -106,18 +101,16 @@ class CompiledMetaNetwork:
         side_by_side = np.zeros((lengths[0], len(inputs), self.inputs), np.float32)
         for row, place in enumerate(order):
             side_by_side[lengths[0] - lengths[row] :, row] = inputs[place]
-        logits, *states = lstm_outputs(side_by_side, lengths, *self.views)
+        logits, states = lstm_outputs(side_by_side, lengths, self.weights)
         outputs = np.empty_like(logits)
         outputs[order] = logits
-        return Trace(outputs, (order, lengths, side_by_side, *states))
+        return Trace(outputs, (order, side_by_side, lengths, states))
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
-        order, *states = trace.saved
+        """See `CompiledMLP`."""
+        order, *computed = trace.saved
         gradient = np.zeros_like(self.parameters)
-        _, weight_hh, _, readout, _ = self.views
-        grad_logits = grad_outputs[order]
-        lstm_gradients(*states, weight_hh, readout, grad_logits, *self.split(gradient))
+        lstm_gradients(*computed, self.weights, grad_outputs[order], self.split(gradient))
         return gradient
 
     def module(self) -> MetaNetwork:
@@ -135,20 +128,9 @@ class CompiledMetaNetwork:
 
     def own(self) -> list[np.ndarray]:
         """Views of the parameters without the units added, in the module's order."""
-        weight_ih, weight_hh, bias, readout, readout_bias = self.views
-        gates = (part.reshape(*part.shape[:-1], 4, -1) for part in (weight_ih, weight_hh, bias))
-        return [*(part[..., : self.units] for part in gates), readout[: self.units], readout_bias]
-
-
-MetaNetworks = TorchMetaNetwork | CompiledMetaNetwork
-
-
-def meta_network(
-    inputs: int, hidden_units: int, initial: float, engine: str, generator: np.random.Generator
-) -> MetaNetworks:
-    """A newly initialised meta-adaptation network."""
-    module = MetaNetwork(inputs, hidden_units, initial, generator)
-    return CompiledMetaNetwork(module) if engine == "compiled" else TorchMetaNetwork(module)
+        *gates, readout, readout_bias = self.weights
+        parts = (part.reshape(*part.shape[:-1], 4, -1)[..., : self.units] for part in gates)
+        return [*parts, readout[: self.units], readout_bias]
 
 
 @kernel
@@ -158,64 +140,48 @@ def logit(beta: float) -> float:
 
 
 @kernel
-def sigmoid(x: np.float32) -> np.float32:
-    """The logistic function."""
-    return np.float32(0.5) + np.float32(0.5) * tanh(np.float32(0.5) * x)
-
-
-@kernel
-def quarters(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def quarters(vector):
     """Four views of a vector, [4 H]."""
     size = len(vector) // 4
     return vector[:size], vector[size : 2 * size], vector[2 * size : 3 * size], vector[3 * size :]
 
 
 @kernel
-def lstm_outputs(
-    sequences: np.ndarray,
-    lengths: np.ndarray,
-    weight_ih: np.ndarray,
-    weight_hh: np.ndarray,
-    bias: np.ndarray,
-    readout: np.ndarray,
-    readout_bias: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The readout of the last hidden state of each sequence, [B], and `lstm_states`."""
-    gates, cells, hidden = lstm_states(sequences, lengths, weight_ih, weight_hh, bias)
-    logits = np.empty(len(lengths), np.float32)
-    for b in range(len(lengths)):
-        logits[b] = dot(readout, hidden[-1, b]) + readout_bias[0]
-    return logits, gates, cells, hidden
+def active_at(lengths, left):
+    """How many of the sequences, the longest first, have at least so many steps left."""
+    active = 0
+    while active < len(lengths) and lengths[active] >= left:
+        active += 1
+    return active
 
 
 @kernel
-def lstm_states(
-    sequences: np.ndarray,
-    lengths: np.ndarray,
-    weight_ih: np.ndarray,
-    weight_hh: np.ndarray,
-    bias: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lstm_outputs(sequences, lengths, weights):
+    """The readout of the last hidden state of each sequence, [B], and the `States`."""
+    states = lstm_states(sequences, lengths, weights)
+    logits = np.empty(len(lengths), np.float32)
+    for b in range(len(lengths)):
+        logits[b] = dot(weights.readout, states.hidden[-1, b]) + weights.readout_bias[0]
+    return logits, states
+
+
+@kernel
+def lstm_states(sequences, lengths, weights):
     """Long short-term memory over B sequences that end together, [T, B, in], from a zero state.
 
-    lengths: of each, the longest first. weight_ih: [in, 4 H], weight_hh: [≤ H, 4 H], bias: [4 H],
-    for H units, whose columns are the input, forget and output gates and the candidate. Returns
-    these four in one array, [T, B, 4 H], and the cell states and hidden states, [T + 1, B, H] each,
-    the zero state included.
+    lengths: of each, the longest first; weights: `Weights`. Returns `States`.
     """
     steps, count, inputs = sequences.shape
-    size = weight_hh.shape[1] // 4
+    size, rows = weights.weight_hh.shape[1] // 4, steps * count
     gates = np.empty((steps, count, 4 * size), np.float32)
-    rows = steps * count
-    product(sequences.reshape(rows, inputs), weight_ih, bias, gates.reshape(rows, 4 * size))
+    flat = gates.reshape(rows, 4 * size)
+    product(sequences.reshape(rows, inputs), weights.weight_ih, weights.bias, flat)
     cells = np.zeros((steps + 1, count, size), np.float32)
     hidden = np.zeros_like(cells)
     for t in range(steps):
-        there = 0
-        while there < count and lengths[there] >= steps - t:
-            there += 1
-        add_product(hidden[t, :there], weight_hh, gates[t, :there])
-        for b in range(there):
+        active = active_at(lengths, steps - t)
+        add_product(hidden[t, :active], weights.weight_hh, gates[t, :active])
+        for b in range(active):
             gate, before, cell, shown = gates[t, b], cells[t, b], cells[t + 1, b], hidden[t + 1, b]
             sigmoids = gate[: 3 * size]
             for j in range(3 * size):
@@ -225,60 +191,38 @@ def lstm_states(
                 candidate[j] = tanh(candidate[j])
                 cell[j] = forget_gate[j] * before[j] + input_gate[j] * candidate[j]
                 shown[j] = output_gate[j] * tanh(cell[j])
-    return gates, cells, hidden
+    return States(gates, cells, hidden)
 
 
 @kernel
-def lstm_gradients(
-    lengths: np.ndarray,
-    sequences: np.ndarray,
-    gates: np.ndarray,
-    cells: np.ndarray,
-    hidden: np.ndarray,
-    weight_hh: np.ndarray,
-    readout: np.ndarray,
-    grad_logits: np.ndarray,
-    grad_weight_ih: np.ndarray,
-    grad_weight_hh: np.ndarray,
-    grad_bias: np.ndarray,
-    grad_readout: np.ndarray,
-    grad_readout_bias: np.ndarray,
-) -> None:
-    """Add the gradients with respect to weights and biases, by backpropagation in time.
+def lstm_gradients(sequences, lengths, states, weights, grad_logits, gradient):
+    """Add to `gradient`, `Weights`, that of a loss, by backpropagation in time.
 
-    grad_logits: the loss's gradient at each logit, float32 [B]; readout: [H]; the states as
-    `lstm_states` returned them.
+    grad_logits: the loss's gradient at each logit, float32 [B]; the others as in `lstm_outputs`.
     """
+    gates, cells, hidden = states
     steps, count, inputs = sequences.shape
-    size, one = len(readout), np.float32(1)
+    size, one = len(weights.readout), np.float32(1)
     back = np.zeros((4 * size, size), np.float32)  # weight_hh transposed
     for first in range(0, 4 * size, LANES):  # a strip at a time: 16 rows stay in the cache
-        for j in range(len(weight_hh)):
+        for j in range(len(weights.weight_hh)):
             for k in range(first, first + LANES):
-                back[k, j] = weight_hh[j, k]
+                back[k, j] = weights.weight_hh[j, k]
     grad_gates = np.zeros_like(gates)
-    grad_hidden, grad_cell = (
-        np.empty((count, size), np.float32),
-        np.zeros((count, size), np.float32),
-    )
+    grad_hidden = np.empty((count, size), np.float32)
+    grad_cell = np.zeros_like(grad_hidden)
     for b in range(count):
         for j in range(size):
-            grad_hidden[b, j] = grad_logits[b] * readout[j]
-            grad_readout[j] += grad_logits[b] * hidden[steps, b, j]
-        grad_readout_bias[0] += grad_logits[b]
+            grad_hidden[b, j] = grad_logits[b] * weights.readout[j]
+            gradient.readout[j] += grad_logits[b] * hidden[steps, b, j]
+        gradient.readout_bias[0] += grad_logits[b]
     for t in range(steps - 1, -1, -1):
-        there = 0
-        while there < count and lengths[there] >= steps - t:
-            there += 1
-        for b in range(there):
+        active = active_at(lengths, steps - t)
+        for b in range(active):
             input_gate, forget_gate, output_gate, candidate = quarters(gates[t, b])
             grad_input, grad_forget, grad_output, grad_candidate = quarters(grad_gates[t, b])
-            cell, before, grad_shown, grad = (
-                cells[t + 1, b],
-                cells[t, b],
-                grad_hidden[b],
-                grad_cell[b],
-            )
+            cell, before = cells[t + 1, b], cells[t, b]
+            grad_shown, grad = grad_hidden[b], grad_cell[b]
             for j in range(size):
                 shown = tanh(cell[j])
                 grad_output[j] = grad_shown[j] * shown * output_gate[j] * (one - output_gate[j])
@@ -287,9 +231,9 @@ def lstm_gradients(
                 grad_forget[j] = grad[j] * before[j] * forget_gate[j] * (one - forget_gate[j])
                 grad_candidate[j] = grad[j] * input_gate[j] * (one - candidate[j] * candidate[j])
                 grad[j] *= forget_gate[j]
-        product(grad_gates[t, :there], back, np.zeros(size, np.float32), grad_hidden[:there])
+        product(grad_gates[t, :active], back, np.zeros(size, np.float32), grad_hidden[:active])
     rows = steps * count
     changes = grad_gates.reshape(rows, 4 * size)
-    add_product(sequences.reshape(rows, inputs).T, changes, grad_weight_ih)
-    add_product(hidden[:-1].reshape(rows, size).T, changes, grad_weight_hh)
-    add_product(np.ones((1, rows), np.float32), changes, grad_bias.reshape(1, 4 * size))
+    add_product(sequences.reshape(rows, inputs).T, changes, gradient.weight_ih)
+    add_product(hidden[:-1].reshape(rows, size).T, changes, gradient.weight_hh)
+    add_product(np.ones((1, rows), np.float32), changes, gradient.bias.reshape(1, 4 * size))

@@ -6,37 +6,37 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.adam import Adam
-from mace_rl.agent.advantages import total
-from mace_rl.agent.elementary import exp, log
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.normaliser import RunningNormaliser
-from mace_rl.agent.products import dot
 from mace_rl.beta.controller import BetaController, Effect
-from mace_rl.beta.lstm import logit, meta_network
+from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork, logit
 from mace_rl.beta.progress import Progress
 from mace_rl.config.beta import MetaConfig
 from mace_rl.environments.rollout import Episode
+from mace_rl.environments.spaces import Spaces
+from mace_rl.numerics.adam import Adam
+from mace_rl.numerics.arrays import total
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import exp, log
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.products import dot
+from mace_rl.state import Stateful, restored, saved
 
 STATE_CLIP = 10.0  # bound of what the LSTM reads of a state, in standard deviations
 SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
 
 
 @dataclass
-class Judged:
+class PendingCredit:
     """The β of one episode, while the updates that follow tell what it did."""
 
-    source: np.ndarray | None  # what the LSTM read for it; None for the first, which is given
+    inputs: np.ndarray | None  # what the LSTM read for it; None for the first, which is given
     direction: np.ndarray  # what it changes in the policy, of length 1, or 0
-    influence: float  # how much of a change that is, at most 1
+    strength: float  # of the bonus in that update, at most 1
     credit: float = 0.0
     updates: int = 0  # that judged it so far
 
 
-class MetaAdaptation(BetaController):
+class MetaAdaptation(Stateful, BetaController):
     """β from an LSTM trained on what helped the extrinsic return (paper; Xu et al. 2018).
 
     The update on rollout n moves the policy along P g(β_n), with g the policy gradient of the total
@@ -51,45 +51,46 @@ class MetaAdaptation(BetaController):
     the LSTM, with a pull to the logit of the initial β. `docs/method.md` derives it.
     """
 
+    STATE = (
+        *("optimiser", "normaliser", "progress", "inputs", "training_batch"),
+        *("alignments", "alignment_weight"),
+    )
+
     def __init__(
         self,
         config: MetaConfig,
         initial: float,
-        engine: str,
-        observation_size: int,
-        action_space: Discrete | Box,
+        spaces: Spaces,
         generator: np.random.Generator,
     ) -> None:
         self.config = config
         self.initial = initial
         self.learns = config.learning_rate > 0
-        self.action_count = int(action_space.n) if isinstance(action_space, Discrete) else 0
-        action_size = (
-            self.action_count if isinstance(action_space, Discrete) else action_space.shape[0]
-        )
-        inputs = observation_size + action_size + 2 + Progress.SIZE
-        self.network = meta_network(inputs, config.hidden_units, initial, engine, generator)
+        self.action_size = spaces.action_size
+        inputs = spaces.observation_size + spaces.action_size + 2 + Progress.SIZE
+        module = MetaNetwork(inputs, config.hidden_units, initial, generator)
+        self.network = CompiledMetaNetwork(module)
         self.optimiser = Adam(
             self.network.parameters, config.learning_rate, config.max_gradient_norm
         )
-        self.normaliser = RunningNormaliser(observation_size)
+        self.normaliser = RunningNormaliser(spaces.observation_size)
         self.progress = Progress()
         # What the LSTM read for the β of each episode since the last `learn`, and for that of the
         # next; None for the first episode.
-        self.sources: deque[np.ndarray | None] = deque([None])
-        self.answer: float | None = None  # β of the next episode, once somebody has asked
-        self.judged: list[Judged] = []
-        self.lessons: list[tuple[np.ndarray, float]] = []  # what was read and its credit, to learn
+        self.inputs: deque[np.ndarray | None] = deque([None])
+        self.next_beta: float | None = None  # β of the next episode, once somebody has asked
+        self.pending: list[PendingCredit] = []
+        self.training_batch: list[tuple[np.ndarray, float]] = []  # what was read, and its credit
         self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 
     @property
     def beta(self) -> float:
         """See `BetaController`; from the network as it is now."""
-        if self.answer is None:
-            source = self.sources[-1]
-            trace = None if source is None else self.network.forward([source])
-            self.answer = self.initial if trace is None else logistic(trace.outputs[0])
-        return self.answer
+        if self.next_beta is None:
+            read = self.inputs[-1]
+            trace = None if read is None else self.network.forward([read])
+            self.next_beta = self.initial if trace is None else beta_of(trace.outputs[0])
+        return self.next_beta
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
@@ -97,9 +98,9 @@ class MetaAdaptation(BetaController):
         self.normaliser.update(episode.observations[:-1])
         self.progress.update(total(episode.rewards))
         if not self.learns:  # nobody will ask what the earlier ones were
-            self.sources.clear()
-        self.sources.append(self.sequence(episode, bonus, beta))
-        self.answer = None
+            self.inputs.clear()
+        self.inputs.append(self.sequence(episode, bonus, beta))
+        self.next_beta = None
 
     def sequence(self, episode: Episode, bonus: np.ndarray, beta: float) -> np.ndarray:
         """What the LSTM reads of an episode: state, action, extrinsic reward and curiosity bonus.
@@ -111,108 +112,87 @@ class MetaAdaptation(BetaController):
         """
         actions = episode.actions
         if actions.ndim == 1:
-            actions = np.eye(self.action_count, dtype=np.float32)[actions]
+            actions = np.eye(self.action_size, dtype=np.float32)[actions]
         states = self.normaliser(episode.observations[:-1], STATE_CLIP)
         length = min(self.config.max_sequence or len(episode), len(episode))
-        return read(
-            *(states, actions, episode.rewards, bonus, self.progress.features(beta), length),
-        )
+        features = self.progress.features(beta)
+        return stretches(states, actions, episode.rewards, bonus, features, length)
 
     def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
         """See `BetaController`: judge the βs of the last updates, then remember this one's."""
         self.credit_all(gradient, strength)
-        done = [judged for judged in self.judged if judged.updates == self.config.horizon]
-        self.judged = self.judged[len(done) :]
-        self.judged += [self.judge(self.sources.popleft(), effect) for effect in effects]
-        for judged in done:
-            if judged.source is not None:
-                self.lessons.append((judged.source, self.bounded(judged.credit)))
-        if len(self.lessons) < self.config.learn_every:
+        done = [item for item in self.pending if item.updates == self.config.horizon]
+        self.pending = self.pending[len(done) :]
+        self.pending += [self.judge(self.inputs.popleft(), effect) for effect in effects]
+        for item in done:
+            if item.inputs is not None:
+                self.training_batch.append((item.inputs, self.bounded(item.credit)))
+        if len(self.training_batch) < self.config.learn_every:
             return None
-        sources, credits = zip(*self.lessons, strict=True)
+        inputs, credits = zip(*self.training_batch, strict=True)
         # Adam descends, so what it gets is minus the mean.
-        self.optimiser.step(-self.logit_gradient(list(sources), np.array(credits)))
-        self.lessons, self.answer = [], None
+        self.optimiser.step(-self.logit_gradient(list(inputs), np.array(credits)))
+        self.training_batch, self.next_beta = [], None
         return sum(credits) / len(credits)
 
-    def judge(self, source: np.ndarray | None, effect: Effect) -> Judged:
-        """The β that the LSTM set for what is in `source` and that had this effect."""
+    def judge(self, inputs: np.ndarray | None, effect: Effect) -> PendingCredit:
+        """The β that the LSTM set when it read `inputs` and that had this effect."""
         length = math.sqrt(dot(effect.direction, effect.direction))
         direction = effect.direction / np.float32(length) if length > 0 else effect.direction
-        return Judged(source, direction, min(1.0, effect.influence))
+        return PendingCredit(inputs, direction, min(1.0, effect.advantage_rms))
 
     def credit_all(self, gradient: np.ndarray, strength: float) -> None:
         """Add one term to the credit of every β under judgement, in units of its usual size.
 
         That is a running root mean square, in which each update counts as one.
         """
-        for judged in self.judged:
-            judged.updates += 1
-        if not (self.judged and strength > 0):
+        for item in self.pending:
+            item.updates += 1
+        if not (self.pending and strength > 0):
             return
-        along = [dot(gradient, judged.direction) / strength for judged in self.judged]
+        along = [dot(gradient, item.direction) / strength for item in self.pending]
         squares = sum(value * value for value in along) / len(along)
         self.alignments = SCALE_DECAY * self.alignments + squares
         self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
         usual = math.sqrt(self.alignments / self.alignment_weight)
         if usual > 0:
-            for judged, value in zip(self.judged, along, strict=True):
-                judged.credit += value / usual * min(1.0, strength) * judged.influence
+            for item, value in zip(self.pending, along, strict=True):
+                item.credit += value / usual * min(1.0, strength) * item.strength
 
     def bounded(self, credit: float) -> float:
         """A sum of `horizon` terms as one whose noise has size 1, within `max_credit`."""
         bound = self.config.max_credit
         return min(max(credit / math.sqrt(self.config.horizon), -bound), bound)
 
-    def logit_gradient(self, sources: list[np.ndarray], credits: np.ndarray) -> np.ndarray:
+    def logit_gradient(self, inputs: list[np.ndarray], credits: np.ndarray) -> np.ndarray:
         """Mean of (credit - prior · (logit - initial logit)) · dlogit/dφ over B β, float32 [n].
 
         By the logit and not by β, whose derivative β (1 - β) would hold a β near 0 or 1 for ever.
-        sources: of each β, float32 [T, input]; credits: [B]; φ are the parameters, [n].
+        inputs: of each β, float32 [T, input]; credits: [B]; φ are the parameters, [n].
         """
-        trace = self.network.forward(sources)
+        trace = self.network.forward(inputs)
         steps = credits - self.config.prior * (trace.outputs - logit(self.initial))
-        return self.network.backward(trace, (steps / len(sources)).astype(np.float32))
+        return self.network.backward(trace, (steps / len(inputs)).astype(np.float32))
 
     def state_dict(self) -> dict[str, Any]:
-        """See `BetaController`."""
-        return {
-            "optimiser": self.optimiser.state_dict(),
-            "normaliser": self.normaliser.state_dict(),
-            "progress": self.progress.state_dict(),
-            "sources": [as_tensor(source) for source in self.sources],
-            "judged": [
-                {"source": as_tensor(item.source), "direction": torch.from_numpy(item.direction)}
-                | {"influence": item.influence, "credit": item.credit, "updates": item.updates}
-                for item in self.judged
-            ],
-            "lessons": [(as_tensor(source), credit) for source, credit in self.lessons],
-            "alignments": [self.alignments, self.alignment_weight],
-        }
+        """See `Stateful`."""
+        return super().state_dict() | {"pending": [saved(vars(item)) for item in self.pending]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `BetaController`."""
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.normaliser.load_state_dict(state["normaliser"])
-        self.progress.load_state_dict(state["progress"])
-        self.sources = deque(as_array(source) for source in state["sources"])
-        self.answer = None
-        self.judged = [
-            Judged(**item | {name: as_array(item[name]) for name in ("source", "direction")})
-            for item in state["judged"]
-        ]
-        self.lessons = [(source.numpy(), credit) for source, credit in state["lessons"]]
-        self.alignments, self.alignment_weight = state["alignments"]
+        """See `Stateful`."""
+        super().load_state_dict(state)
+        self.pending = [PendingCredit(**restored(None, item)) for item in state["pending"]]
+        self.next_beta = None
 
 
 @kernel
-def logistic(x: np.float32) -> float:
-    """1 / (1 + e⁻ˣ), float64, which is below 1 as long as x is below 36."""
-    return 1 / (1 + np.float64(exp(-x)))
+def beta_of(logit: np.float32) -> float:
+    """1 / (1 + e⁻ˣ), float64, which is below 1 as long as the logit x is below 36."""
+    return 1 / (1 + np.float64(exp(-logit)))
 
 
 @kernel
-def read(
+def stretches(
     states: np.ndarray,
     actions: np.ndarray,
     rewards: np.ndarray,
@@ -245,13 +225,3 @@ def logarithm(x: float) -> np.float32:
     """sign(x) log(1 + |x|)."""
     size = log(np.float32(1 + abs(x)))
     return -size if x < 0 else size
-
-
-def as_tensor(array: np.ndarray | None) -> torch.Tensor | None:
-    """For a checkpoint."""
-    return None if array is None else torch.from_numpy(array)
-
-
-def as_array(tensor: torch.Tensor | None) -> np.ndarray | None:
-    """From a checkpoint."""
-    return None if tensor is None else tensor.numpy()

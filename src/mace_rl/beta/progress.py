@@ -1,19 +1,21 @@
 """How training goes: what lets β follow progress and stagnation over many episodes."""
 
 import math
-from typing import Any
 
 import numpy as np
 
-from mace_rl.agent.elementary import log
 from mace_rl.beta.lstm import logit
+from mace_rl.numerics.elementary import log
+from mace_rl.state import Stateful
 
 FAST, SLOW = 0.1, 0.02  # weights of the last return in the two moving averages
 IMPROVEMENT = 0.1  # of the returns' standard deviation: less is not progress
 
 
-class Progress:
+class Progress(Stateful):
     """Moving averages of the extrinsic return, and since when they have not risen."""
+
+    STATE = ("count", "mean", "squares", "fast", "slow", "best", "stalled")
 
     SIZE = 4  # of `features`
 
@@ -54,11 +56,3 @@ class Progress:
             logit(min(max(beta, 1e-6), 1 - 1e-6)) / 2,
         )
         return np.array([min(max(float(feature), -3.0), 3.0) for feature in features])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        vars(self).update(state)

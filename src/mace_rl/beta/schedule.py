@@ -7,10 +7,13 @@ import numpy as np
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.beta import ConstantBeta, ExponentialBeta
 from mace_rl.environments.rollout import Episode
+from mace_rl.state import Stateful
 
 
-class ExponentialSchedule(BetaController):
+class ExponentialSchedule(Stateful, BetaController):
     """β_n = max(floor, initial · decay^(n-1)): the paper's ablation with a fixed schedule."""
+
+    STATE = ("decayed",)
 
     def __init__(self, config: ExponentialBeta) -> None:
         self.config = config
@@ -24,14 +27,6 @@ class ExponentialSchedule(BetaController):
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         self.decayed *= self.config.decay
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `BetaController`."""
-        return {"decayed": self.decayed}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `BetaController`."""
-        self.decayed = state["decayed"]
 
 
 class Constant(BetaController):

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.bonus.novelty import novelty
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.state import Stateful
 from mace_rl.streams import Streams
 
 SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
@@ -44,12 +45,14 @@ def relevance(
     return result
 
 
-class Curiosity(IntrinsicReward):
+class Curiosity(Stateful, IntrinsicReward):
     """R_curiosity of every step, and the memory and novelty estimates it rests on.
 
     An episode is rewarded for what was known before it; `remember` adds it to what is known.
     Without a memory all is relevant: the bonus is the novelty.
     """
+
+    STATE = ("memory", "steps", "normaliser", "novelty")
 
     largest = 1.0
 
@@ -57,7 +60,6 @@ class Curiosity(IntrinsicReward):
         self,
         memory: MemoryConfig | None,
         novelty_config: NoveltyConfig,
-        engine: str,
         observation_space: Box | Discrete,
         observation_size: int,
         streams: Streams,
@@ -67,7 +69,7 @@ class Curiosity(IntrinsicReward):
         self.normaliser = RunningNormaliser(observation_size)
         self.steps = 0  # remembered or not
         self.discrete = isinstance(observation_space, Discrete)
-        self.novelty = novelty(novelty_config, engine, observation_space, self.normaliser, streams)
+        self.novelty = novelty(novelty_config, observation_space, self.normaliser, streams)
 
     def bonus(self, episode: Episode) -> Bonus:
         """R_curiosity of each step: novelty × relevance of the state it led to."""
@@ -106,12 +108,12 @@ class Curiosity(IntrinsicReward):
         if not self.discrete:
             self.normaliser.update(episode.observations[1:])
         self.novelty.observe(episode.observations[1:])
-        self._lay_out()
+        self._build_index()
 
-    def _lay_out(self) -> None:
+    def _build_index(self) -> None:
         # What the memory compares states with until the next episode is remembered.
         if self.memory is not None and len(self.memory) > 0:
-            self.memory.lay_out(self.normaliser.mean, self.scale())
+            self.memory.build_index(self.normaliser.mean, self.scale())
             returns = self.memory.values[: len(self.memory), -1]
             self.worst, self.best = float(returns.min()), float(returns.max())
 
@@ -125,20 +127,7 @@ class Curiosity(IntrinsicReward):
         before, after = episode.observations[:-1], episode.observations[1:]
         memory.write(before[chosen], after[chosen], episode.rewards[chosen], returns[chosen])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        return {
-            "memory": None if self.memory is None else self.memory.state_dict(),
-            "steps": self.steps,
-            "normaliser": self.normaliser.state_dict(),
-            "novelty": self.novelty.state_dict(),
-        }
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        if self.memory is not None:
-            self.memory.load_state_dict(state["memory"])
-        self.steps = state["steps"]
-        self.normaliser.load_state_dict(state["normaliser"])
-        self.novelty.load_state_dict(state["novelty"])
-        self._lay_out()
+        """See `Stateful`."""
+        super().load_state_dict(state)
+        self._build_index()

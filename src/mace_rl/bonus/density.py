@@ -1,16 +1,16 @@
 """Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs.
 
 `MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same in
-compiled code; `DensityEstimator` makes a density of either's outputs.
+compiled code; `DensityEstimator` makes a density of its outputs.
 """
 
 import numpy as np
 import torch
 from torch.nn.functional import linear
 
-from mace_rl.agent.elementary import exp
-from mace_rl.agent.kernels import HALF_LOG_TAU, kernel
-from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, Trace, mlp
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import HALF_LOG_TAU, exp
+from mace_rl.numerics.network import CompiledMLP, Trace, mlp
 
 SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
 
@@ -27,8 +27,8 @@ class MaskedAutoencoder(torch.nn.Module):
         layers = mlp([size, hidden_units, 2 * size], 0.1, generator)
         self.hidden, self.output = (part for part in layers if isinstance(part, torch.nn.Linear))
         # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
-        degrees = torch.arange(hidden_units) % max(size - 1, 1) + 1
-        coordinates = torch.arange(1, size + 1)
+        degrees = torch.arange(hidden_units, device="cpu") % max(size - 1, 1) + 1
+        coordinates = torch.arange(1, size + 1, device="cpu")
         inward = degrees[:, None] >= coordinates
         outward = (coordinates[:, None] > degrees).repeat(2, 1)
         self.masks = inward.float(), outward.float()
@@ -53,13 +53,8 @@ class CompiledAutoencoder(CompiledMLP):
             weights[:] = mask.numpy().T
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
+        """See `CompiledMLP`."""
         return super().backward(trace, grad_outputs) * self.mask
-
-    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Network`."""
-        gradient, inward = super().gradients(trace, grad_outputs)
-        return gradient * self.mask, inward
 
 
 class DensityEstimator:
@@ -68,13 +63,8 @@ class DensityEstimator:
     Being autoregressive it is normalised: p integrates to 1 whatever the weights are.
     """
 
-    def __init__(
-        self, size: int, hidden_units: int, engine: str, generator: np.random.Generator
-    ) -> None:
-        module = MaskedAutoencoder(size, hidden_units, generator)
-        self.network: Network = (
-            CompiledAutoencoder(module) if engine == "compiled" else TorchNetwork(module)
-        )
+    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
+        self.network = CompiledAutoencoder(MaskedAutoencoder(size, hidden_units, generator))
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, float32 [N, size] → [N]."""

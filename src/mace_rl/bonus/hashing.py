@@ -2,20 +2,19 @@
 
 import math
 from collections import Counter
-from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.bonus import HashCountsBonus
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.state import Stateful
 
 
-class HashCounts(IntrinsicReward):
+class HashCounts(Stateful, IntrinsicReward):
     """1 / √n(φ(s')) with φ(s) = sign(A g(s)), SimHash, in `bits` bits (section 2.2, algorithm 1).
 
     A is a fixed Gaussian matrix, so that states at a small angle share most bits. n counts this
@@ -26,6 +25,8 @@ class HashCounts(IntrinsicReward):
     collected, all visits are counted anew after each episode; then φ stays. Discrete states are
     one-hot and stay as they are.
     """
+
+    STATE = ("matrix", "normaliser", "early", "counts")
 
     largest = 1.0
 
@@ -64,24 +65,6 @@ class HashCounts(IntrinsicReward):
             self.early = states = np.concatenate([self.early, states])
             self.counts.clear()
         self.counts.update(self.codes(states))
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `IntrinsicReward`."""
-        return {
-            "matrix": torch.from_numpy(self.matrix.copy()),
-            "normaliser": self.normaliser.state_dict(),
-            "early": torch.from_numpy(self.early.copy()),
-            "codes": torch.tensor(list(self.counts), dtype=torch.int64),
-            "counts": torch.tensor(list(self.counts.values()), dtype=torch.int64),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `IntrinsicReward`."""
-        self.matrix = state["matrix"].numpy().copy()
-        self.normaliser.load_state_dict(state["normaliser"])
-        self.early = state["early"].numpy().copy()
-        counts = zip(state["codes"].tolist(), state["counts"].tolist(), strict=True)
-        self.counts = Counter(dict(counts))
 
 
 @kernel

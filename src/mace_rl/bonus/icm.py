@@ -3,12 +3,12 @@
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.kernels import log_prob_gradient
-from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, mlp
-from mace_rl.agent.products import dot
+from mace_rl.agent.distribution import log_prob_gradient
 from mace_rl.bonus.intrinsic import PredictionError
 from mace_rl.config.bonus import ICMBonus
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.network import CompiledMLP, mlp
+from mace_rl.numerics.products import dot
 
 
 class IntrinsicCuriosityModule(PredictionError):
@@ -31,15 +31,13 @@ class IntrinsicCuriosityModule(PredictionError):
     def __init__(
         self,
         config: ICMBonus,
-        engine: str,
         observation_space: Box | Discrete,
         action_space: Box | Discrete,
         observation_size: int,
         generator: np.random.Generator,
     ) -> None:
-        def new(inputs: int, outputs: int) -> Network:
-            module = mlp([inputs, config.hidden_units, outputs], 1.0, generator)
-            return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
+        def new(inputs: int, outputs: int) -> CompiledMLP:
+            return CompiledMLP(mlp([inputs, config.hidden_units, outputs], 1.0, generator))
 
         if isinstance(action_space, Discrete):
             actions, stds = int(action_space.n), 0
@@ -50,10 +48,10 @@ class IntrinsicCuriosityModule(PredictionError):
         self.inverse_model = new(2 * features, actions)
         self.forward_model = new(features + actions, features)
         networks = self.features, self.inverse_model, self.forward_model
-        ends = np.cumsum([len(network.parameters) for network in networks])
+        ends = np.cumsum([len(one.parameters) for one in networks])
         parameters = np.empty(ends[-1], np.float32)
-        for network, memory in zip(networks, np.split(parameters, ends[:-1]), strict=True):
-            network.move_to(memory)
+        for one, memory in zip(networks, np.split(parameters, ends[:-1]), strict=True):
+            one.move_to(memory)
         super().__init__(config, parameters, observation_space, observation_size, generator)
         self.action_space = action_space
         self.log_std = np.zeros(stds, np.float32)  # of the inverse model
@@ -86,12 +84,10 @@ class IntrinsicCuriosityModule(PredictionError):
         inverse = self.inverse_model.forward(np.hstack([before, after]))
         forward = self.forward_model.forward(np.hstack([before, action]))
 
-        grad_action = np.empty_like(inverse.outputs)
-        log_prob_gradient(
-            *(inverse.outputs, self.log_std, action if len(self.log_std) else action.argmax(1)),
-            *(np.full(count, (weight - 1) / count, np.float32), 0.0),
-            *(grad_action, np.zeros_like(self.log_std), np.zeros(3)),
-        )
+        taken = action if len(self.log_std) else action.argmax(1)
+        weights, unused = np.full(count, (weight - 1) / count, np.float32), self.log_std.copy()
+        grad, _ = log_prob_gradient(inverse.outputs, self.log_std, taken, weights, 0.0, unused)
+        grad_action = np.ascontiguousarray(grad[:, : action.shape[1]])
         grad_predicted = np.float32(weight / count) * (forward.outputs - after)
         inverse_gradient, to_both = self.inverse_model.gradients(inverse, grad_action)
         forward_gradient, to_before = self.forward_model.gradients(forward, grad_predicted)

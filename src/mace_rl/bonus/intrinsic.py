@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.adam import Adam
-from mace_rl.agent.normaliser import RunningNormaliser
 from mace_rl.config.bonus import ICMBonus, RNDBonus
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.adam import Adam
+from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.state import Stateful
 
 CLIP = 5.0  # bound of whitened observations, in standard deviations (Burda et al. 2018, 2.4)
 
@@ -55,7 +56,7 @@ class IntrinsicReward(ABC):
         """Restore what `state_dict` returned."""
 
 
-class PredictionError(IntrinsicReward):
+class PredictionError(Stateful, IntrinsicReward):
     """The error of networks that learn to predict what is visited: high where little was learnt.
 
     They learn from each episode once, when that is over, in minibatches of `batch_size` steps in
@@ -63,6 +64,8 @@ class PredictionError(IntrinsicReward):
     clipped to ±`CLIP`; of the first episode, before which there are none, as they are. Discrete
     ones are one-hot and stay as they are.
     """
+
+    STATE: tuple[str, ...] = ("optimiser", "normaliser", "generator")
 
     def __init__(
         self,
@@ -106,17 +109,3 @@ class PredictionError(IntrinsicReward):
         order = self.generator.permutation(len(inputs))
         for chosen in np.array_split(order, math.ceil(len(order) / self.config.batch_size)):
             self.optimiser.step(self.gradient(inputs[chosen]))
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `IntrinsicReward`."""
-        return {
-            "optimiser": self.optimiser.state_dict(),
-            "normaliser": self.normaliser.state_dict(),
-            "generator": self.generator.bit_generator.state,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `IntrinsicReward`."""
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.normaliser.load_state_dict(state["normaliser"])
-        self.generator.bit_generator.state = state["generator"]

@@ -1,25 +1,26 @@
-"""Episodic memory: a differentiable neural dictionary (paper, supplement; Pritzel et al. 2017)."""
+"""Episodic memory: a neural dictionary (paper, supplement; Pritzel et al. 2017)."""
 
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from mace_rl.agent.kernels import kernel
 from mace_rl.config.bonus import MemoryConfig
-from mace_rl.nearest import Neighbours
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.nearest import Neighbours
+from mace_rl.state import Stateful
 
 
-class EpisodicMemory:
+class EpisodicMemory(Stateful):
     """A fixed number of (key, value) entries; the least recently used one is overwritten.
 
     Keys are states as observed. They are compared in an embedding that the caller gives, here the
-    running standardisation, so that stored keys follow it as it changes: `lay_out` prepares that
-    once, for all that is asked until the next `write`.
+    running standardisation, so that stored keys follow it as it changes: `build_index` prepares
+    that once, for all that is asked until the next `write`.
 
     A value is (next state, reward, return-to-go): what came of being in the state.
     """
+
+    STATE = ("keys", "values", "usage", "number", "read", "time", "written", "stored")
 
     def __init__(self, config: MemoryConfig, key_size: int) -> None:
         self.config = config
@@ -66,7 +67,7 @@ class EpisodicMemory:
         self.newest_first = np.concatenate([oldest[::-1], before[stays[before]]])
         self.neighbours = None
 
-    def lay_out(self, mean: np.ndarray, std: np.ndarray) -> None:
+    def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
         """From now on distances are Euclidean between (x - mean) / std; both are [key]."""
         # Of equally near entries the first is read: the last written, so that what came of a state
         # lately is what is remembered of it.
@@ -78,10 +79,10 @@ class EpisodicMemory:
 
         Returns squared distances per dimension, so that the kernel does not depend on how many
         there are, float32 [N, k] ascending, and the entries, int64 [N, k]. Raises `LookupError` if
-        nothing is stored, or was laid out since it was.
+        nothing is stored, or there is no index of it.
         """
         if not self.neighbours:
-            raise LookupError("the episodic memory is empty, or not laid out since it was written")
+            raise LookupError("the episodic memory is empty, or not indexed since it was written")
         count = min(self.config.neighbours, len(self.neighbours))
         squared_distances, places = self.neighbours.nearest(states, count)
         entries = self.newest_first[places]
@@ -96,36 +97,11 @@ class EpisodicMemory:
         """
         return recollect(*self.search(states), self.values[:, -1], self.config.kernel_bandwidth)
 
-    def lookup(self, queries: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """`recall` as autograd can follow it, with respect to queries and values.
-
-        For whoever trains through the memory; the method does not. `values` stand for the memory's.
-        Which entries are nearest has no gradient.
-        """
-        _, entries = self.search(queries.detach().float().numpy())
-        assert self.neighbours is not None  # else `search` has raised
-        keys, unit = torch.from_numpy(self.keys[entries]), torch.from_numpy(self.neighbours.std)
-        squares = ((queries[:, None] - keys) / unit).square().mean(-1)
-        kernel = 1 / (squares + self.config.kernel_bandwidth)
-        weights = kernel / kernel.sum(1, keepdim=True)
-        recalled = (weights[..., None] * values[torch.from_numpy(entries)]).sum(1)
-        return recalled, self.config.kernel_bandwidth * kernel[:, 0]  # the nearest comes first
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        arrays = {name: torch.from_numpy(getattr(self, name).copy()) for name in ARRAYS}
-        return arrays | {"time": self.time, "written": self.written, "stored": self.stored}
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned; to be laid out before the next look-up."""
-        for name in ARRAYS:
-            getattr(self, name)[:] = state[name].numpy()
-        self.time, self.written, self.stored = state["time"], state["written"], state["stored"]
+        """See `Stateful`; `build_index` before the next look-up."""
+        super().load_state_dict(state)
         self.newest_first = np.argsort(-self.number[: len(self)])
         self.neighbours = None
-
-
-ARRAYS = ("keys", "values", "usage", "number", "read")  # of `EpisodicMemory`
 
 
 @kernel

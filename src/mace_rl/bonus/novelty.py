@@ -5,19 +5,20 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.adam import Adam
-from mace_rl.agent.elementary import exp, fma
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.normaliser import RunningNormaliser, standardised
 from mace_rl.bonus.density import DensityEstimator
 from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.config.plugins import make
 from mace_rl.config.section import ConfigError
-from mace_rl.finite import require_finite
-from mace_rl.nearest import Neighbours
+from mace_rl.numerics.adam import Adam
+from mace_rl.numerics.arrays import quantile
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import exp, fma
+from mace_rl.numerics.finite import require_finite
+from mace_rl.numerics.nearest import Neighbours
+from mace_rl.numerics.normaliser import RunningNormaliser, standardised
+from mace_rl.state import Stateful
 from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
@@ -56,7 +57,6 @@ class Novelty(ABC):
 
 def novelty(
     config: NoveltyConfig,
-    engine: str,
     space: Box | Discrete,
     normaliser: RunningNormaliser,
     streams: Streams,
@@ -70,7 +70,7 @@ def novelty(
         case "counts" if isinstance(space, Discrete):
             return CountNovelty(config, size)
         case "density" if isinstance(space, Box):
-            return DensityNovelty(config, engine, normaliser, streams)
+            return DensityNovelty(config, normaliser, streams)
         case "custom" if config.estimator is not None:
             key, given = "novelty.estimator", (size, streams["novelty"])
             return make(config.estimator, key, Novelty, False, *given, **config.arguments)
@@ -80,12 +80,14 @@ def novelty(
     )
 
 
-class CountNovelty(Novelty):
+class CountNovelty(Stateful, Novelty):
     """1 / n(s) with counts that decay (paper, supplement): for Discrete observations.
 
     n(s) counts this visit too, those earlier in the episode included, so a first visit has
     novelty 1. After each episode all counts are multiplied by `count_decay`.
     """
+
+    STATE = ("counts",)
 
     def __init__(self, config: NoveltyConfig, observation_size: int) -> None:
         self.config = config
@@ -108,16 +110,8 @@ class CountNovelty(Novelty):
         """See `Novelty`; states are one-hot."""
         self.counts = (self.counts + states.sum(axis=0)) * self.config.count_decay
 
-    def state_dict(self) -> dict[str, Any]:
-        """See `Novelty`."""
-        return {"counts": torch.from_numpy(self.counts.copy())}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Novelty`."""
-        self.counts = state["counts"].numpy().copy()
-
-
-class DensityNovelty(Novelty):
+class DensityNovelty(Stateful, Novelty):
     """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
 
     Both refer to a buffer that covers the visited states, as `normaliser` sees them, whose owner
@@ -134,10 +128,14 @@ class DensityNovelty(Novelty):
     `refresh_every` steps have been taken since it was last; in between nothing changes.
     """
 
+    STATE = (
+        *("buffer", "seen", "steps", "refreshed", "waiting", "optimiser", "batches"),
+        *("usual_distances", "usual_log_density", "mean", "std", "varied"),
+    )
+
     def __init__(
         self,
         config: NoveltyConfig,
-        engine: str,
         normaliser: RunningNormaliser,
         streams: Streams,
     ) -> None:
@@ -149,23 +147,21 @@ class DensityNovelty(Novelty):
         self.steps = 0  # states ever observed, of which one in `write_every` is written
         self.refreshed = 0  # at which of these steps
         self.waiting = np.empty((0, size), np.float32)  # states to be written since then
-        self.density = DensityEstimator(
-            size, config.density_hidden_units, engine, streams["density"]
-        )
+        self.density = DensityEstimator(size, config.density_hidden_units, streams["density"])
         self.optimiser = Adam(self.density.network.parameters, config.density_learning_rate)
         self.batches = streams["density_batches"]
         self.usual_distances = np.zeros(len(config.neighbours))
         self.usual_log_density = 0.0
         self.ensemble = np.array(sorted(config.neighbours))
         self.largest = max(config.neighbours)
-        self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
+        self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
 
     @property
     def visited(self) -> np.ndarray:
         """The states in the buffer, [n, observation]."""
         return self.buffer[: self.seen]
 
-    def _lay_out(self, mean: np.ndarray, std: np.ndarray, varied: np.ndarray) -> None:
+    def _build_index(self, mean: np.ndarray, std: np.ndarray, varied: np.ndarray) -> None:
         """Prepare what states are compared with until the next refresh."""
         self.mean, self.std, self.varied = mean.copy(), std.copy(), varied.copy()
         self.dimensions = max(1, int(varied.sum()))  # of the observation, that vary
@@ -206,9 +202,9 @@ class DensityNovelty(Novelty):
         self.buffer[self.seen : self.seen + len(free)] = free
         self.seen += len(free)
         normaliser = self.normaliser
-        self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
+        self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
         if len(self.waiting) > len(free) and self._replace_redundant(self.waiting[len(free) :]):
-            self._lay_out(normaliser.mean, normaliser.std, normaliser.varied)
+            self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
         self.waiting, self.refreshed = self.waiting[:0], self.steps
         if self.seen <= self.largest:
             return
@@ -247,29 +243,10 @@ class DensityNovelty(Novelty):
         self.buffer[sample[new >= 0]] = states[new[new >= 0]]
         return bool((new >= 0).any())
 
-    def state_dict(self) -> dict[str, Any]:
-        """See `Novelty`."""
-        arrays = ("waiting", "usual_distances", "mean", "std", "varied")
-        return {name: torch.from_numpy(getattr(self, name).copy()) for name in arrays} | {
-            "buffer": torch.from_numpy(self.visited.copy()),
-            "steps": self.steps,
-            "refreshed": self.refreshed,
-            "density": self.optimiser.state_dict(),
-            "batches": self.batches.bit_generator.state,
-            "usual_log_density": self.usual_log_density,
-        }
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Novelty`."""
-        self.seen = len(state["buffer"])
-        self.buffer[: self.seen] = state["buffer"].numpy()
-        self.steps, self.refreshed = state["steps"], state["refreshed"]
-        self.waiting = state["waiting"].numpy().copy()
-        self.optimiser.load_state_dict(state["density"])
-        self.batches.bit_generator.state = state["batches"]
-        self.usual_distances = state["usual_distances"].numpy().copy()
-        self.usual_log_density = state["usual_log_density"]
-        self._lay_out(*(state[name].numpy() for name in ("mean", "std", "varied")))
+        """See `Stateful`."""
+        super().load_state_dict(state)
+        self._build_index(self.mean, self.std, self.varied)
 
 
 @kernel
@@ -319,16 +296,6 @@ def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.nd
         if not below <= 0:  # so written, NaN stays NaN
             result[t] = 1 - exp(-below / np.float32(dimensions))
     return result
-
-
-@kernel
-def quantile(values: np.ndarray, share: float) -> float:
-    """The value below which are so many of them, float64 [N], linear between neighbours."""
-    ordered = np.sort(values)
-    place = share * (len(ordered) - 1)
-    before = int(place)
-    after = min(before + 1, len(ordered) - 1)
-    return ordered[before] + (place - before) * (ordered[after] - ordered[before])
 
 
 @kernel

@@ -1,17 +1,15 @@
 """Random network distillation, RND (Burda et al. 2018)."""
 
 import math
-from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.network import CompiledMLP, Network, TorchNetwork, mlp
-from mace_rl.agent.products import dot
 from mace_rl.bonus.intrinsic import PredictionError
 from mace_rl.config.bonus import RNDBonus
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.network import CompiledMLP, mlp
+from mace_rl.numerics.products import dot
 
 
 class RandomNetworkDistillation(PredictionError):
@@ -23,22 +21,20 @@ class RandomNetworkDistillation(PredictionError):
     those of every bonus here, so that only the bonus differs.
     """
 
+    STATE = (*PredictionError.STATE, "fixed")
+
     def __init__(
         self,
         config: RNDBonus,
-        engine: str,
         observation_space: Box | Discrete,
         observation_size: int,
         generator: np.random.Generator,
     ) -> None:
         sizes = [observation_size, config.hidden_units, config.feature_units]
-
-        def new() -> Network:
-            module = mlp(sizes, math.sqrt(2), generator)
-            return CompiledMLP(module) if engine == "compiled" else TorchNetwork(module)
-
-        self.target, self.network = new(), new()
-        parameters = self.network.parameters
+        self.target, self.network = (
+            CompiledMLP(mlp(sizes, math.sqrt(2), generator)) for _ in range(2)
+        )
+        self.fixed, parameters = self.target.parameters, self.network.parameters
         super().__init__(config, parameters, observation_space, observation_size, generator)
 
     def inputs(self, episode: Episode) -> np.ndarray:
@@ -55,13 +51,3 @@ class RandomNetworkDistillation(PredictionError):
         trace = self.network.forward(inputs)
         difference = trace.outputs - self.target.forward(inputs).outputs
         return self.network.backward(trace, 2 * difference / np.float32(difference.size))
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `IntrinsicReward`."""
-        target = torch.from_numpy(self.target.parameters.copy())
-        return super().state_dict() | {"target": target}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `IntrinsicReward`."""
-        super().load_state_dict(state)
-        self.target.parameters[:] = state["target"].numpy()

@@ -2,9 +2,9 @@
 
 from typing import Any, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Reference, Section
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class CompiledNetwork(Section):
@@ -18,43 +18,10 @@ class TorchModule(Section):
 
     kind: Literal["torch"]
     module: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 NetworkConfig = CompiledNetwork | TorchModule
-
-
-class NetworkValue(Section):
-    """A critic that is a network, as the policy is."""
-
-    kind: Literal["network"]
-
-    def __str__(self) -> str:
-        return "network"
-
-
-class DictionaryValue(Section):
-    """A critic that is a dictionary of states and returns (Pritzel et al. 2017)."""
-
-    kind: Literal["dictionary"]
-    capacity: PositiveInt  # states
-    neighbours: PositiveInt  # k, whose returns make a value
-    kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
-    learning_rate: PositiveFloat = Field(le=1)  # α, at which a remembered state's return moves
-
-    def __str__(self) -> str:
-        return f"dictionary of {self.capacity} states"
-
-    @model_validator(mode="after")
-    def _neighbours_fit(self) -> "DictionaryValue":
-        if self.neighbours > self.capacity:
-            raise ValueError(
-                f"neighbours is {self.neighbours}, which must not exceed capacity, {self.capacity}"
-            )
-        return self
-
-
-CriticConfig = NetworkValue | DictionaryValue
 
 
 class PPOConfig(Section):
@@ -63,17 +30,16 @@ class PPOConfig(Section):
     actor_learning_rate: PositiveFloat = Field(lt=1)
     critic_learning_rate: PositiveFloat = Field(lt=1)
     discount: float = Field(ge=0, le=1)  # γ
-    epochs: PositiveInt  # K, passes over the rollout at each update
+    epochs: Count  # K, passes over the rollout at each update
     clip: PositiveFloat = Field(lt=1)  # ε
     gae_lambda: float = Field(ge=0, le=1)  # λ; 1 is the Monte Carlo return minus the baseline
     entropy_coefficient: NonNegativeFloat
     # An update follows the first episode end at which this many steps have been collected, so 1
     # is one update per episode. Rollouts are whole episodes: β belongs to an episode.
-    rollout_steps: PositiveInt
-    minibatch_size: PositiveInt | None  # None: the whole rollout is one batch
+    rollout_steps: Count
+    minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
-    hidden_units: list[PositiveInt] = Field(min_length=1)
-    critic: CriticConfig = Field(default=NetworkValue(kind="network"), discriminator="kind")
+    hidden_units: list[Units] = Field(min_length=1)
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
     max_gradient_norm: PositiveFloat
     normalise_observations: bool
@@ -85,3 +51,11 @@ class PPOConfig(Section):
     scale_advantages: bool
     smallest_advantage: PositiveFloat
     centre_advantages: bool  # subtract the rollout's mean from total advantages
+
+    @model_validator(mode="before")
+    @classmethod
+    def _critics_are_networks(cls, values: Any) -> Any:
+        # Records of earlier runs say so; there is nothing else to say any more.
+        if isinstance(values, dict) and values.get("critic") == {"kind": "network"}:
+            return {key: value for key, value in values.items() if key != "critic"}
+        return values

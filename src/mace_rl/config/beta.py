@@ -1,23 +1,23 @@
 """Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Reference, Section
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class MetaConfig(Section):
     """Meta-adaptation network: the LSTM that sets β (paper, supplement)."""
 
-    hidden_units: PositiveInt
+    hidden_units: Units
     learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
     max_gradient_norm: PositiveFloat
-    horizon: PositiveInt  # updates after an episode that judge its β
-    learn_every: PositiveInt  # βs that have been judged for one step of the optimiser
+    horizon: Count  # updates after an episode that judge its β
+    learn_every: Count  # βs that have been judged for one step of the optimiser
     prior: NonNegativeFloat  # pull of β's logit back to the initial β's, per unit of distance
     max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
-    max_sequence: PositiveInt | None  # longer episodes are condensed to this many elements
+    max_sequence: Count | None  # longer episodes are condensed to this many elements
 
 
 class NoBonus(Section):
@@ -52,7 +52,7 @@ class BanditBeta(Section):
 
     kind: Literal["bandit"]
     arms: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=1)  # the βs to choose from
-    window: PositiveInt  # pulls that count, the last ones
+    window: Count  # pulls that count, the last ones
     exploration: NonNegativeFloat  # of the bonus √(1 / pulls), in ranges of the return
     epsilon: float = Field(ge=0, le=1)  # probability of an arm at random
 
@@ -99,7 +99,7 @@ class CustomBeta(Section):
 
     kind: Literal["custom"]
     rule: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 BetaRule = ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | CustomBeta

@@ -1,19 +1,19 @@
 """Settings of `mace_rl.bonus`: memory, novelty, and the bonuses that can be had."""
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
-from mace_rl.config.section import Reference, Section
+from mace_rl.config.section import Arguments, Count, Reference, Section, Units
 
 
 class MemoryConfig(Section):
-    """Episodic memory: a differentiable neural dictionary (paper, supplement)."""
+    """Episodic memory: a neural dictionary (paper, supplement)."""
 
-    capacity: PositiveInt  # entries
-    neighbours: PositiveInt  # k of the top-k lookup
+    capacity: Count  # entries
+    neighbours: Count  # k of the top-k lookup
     kernel_bandwidth: PositiveFloat  # δ of the kernel 1 / (d² + δ), in standardised units
-    write_every: PositiveInt  # one step in this many is written
+    write_every: Count  # one step in this many is written
 
     @model_validator(mode="after")
     def _neighbours_fit(self) -> "MemoryConfig":
@@ -31,18 +31,18 @@ class NoveltyConfig(Section):
     # **arguments), with what mace_rl.bonus.novelty.Novelty asks for.
     kind: Literal["auto", "counts", "density", "custom"] = "auto"
     estimator: Reference | None = None
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
     count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
-    buffer_size: PositiveInt  # visited states that k-NN and density refer to, a cover of ...
-    write_every: PositiveInt  # ... one in so many
-    neighbours: list[PositiveInt] = Field(min_length=1)  # one k-NN estimator for each k
-    refresh_every: PositiveInt  # steps after which what is new is judged anew, at an episode's end
-    calibration_states: PositiveInt  # a sample of them says what distance is usual
+    buffer_size: Count  # visited states that k-NN and density refer to, a cover of ...
+    write_every: Count  # ... one in so many
+    neighbours: list[Count] = Field(min_length=1)  # one k-NN estimator for each k
+    refresh_every: Count  # steps after which what is new is judged anew, at an episode's end
+    calibration_states: Count  # a sample of them says what distance is usual
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
-    density_hidden_units: PositiveInt
+    density_hidden_units: Units
     density_learning_rate: PositiveFloat = Field(lt=1)
-    density_batch_size: PositiveInt
-    density_steps: PositiveInt  # gradient steps of the density estimator in a refresh
+    density_batch_size: Count
+    density_steps: Count  # gradient steps of the density estimator in a refresh
 
     @model_validator(mode="after")
     def _neighbours_fit(self) -> "NoveltyConfig":
@@ -73,10 +73,10 @@ class ICMBonus(Section):
     """Intrinsic curiosity module (Pathak et al. 2017): `mace_rl.bonus.icm`."""
 
     kind: Literal["icm"]
-    feature_units: PositiveInt = 32  # numbers in φ(s); the paper has 288 for images
-    hidden_units: PositiveInt = 64  # of the one hidden layer in each of its three networks
+    feature_units: Units = 32  # numbers in φ(s); the paper has 288 for images
+    hidden_units: Units = 64  # of the one hidden layer in each of its three networks
     learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper's
-    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+    batch_size: Count = 64  # steps; each episode is learnt from once
     forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
     scale: PositiveFloat = 1.0  # η
 
@@ -85,10 +85,10 @@ class RNDBonus(Section):
     """Random network distillation (Burda et al. 2018): `mace_rl.bonus.rnd`."""
 
     kind: Literal["rnd"]
-    feature_units: PositiveInt = 64  # outputs of both networks; the paper has 512 for images
-    hidden_units: PositiveInt = 64  # of the one hidden layer in each
+    feature_units: Units = 64  # outputs of both networks; the paper has 512 for images
+    hidden_units: Units = 64  # of the one hidden layer in each
     learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper has 0.0001, for images
-    batch_size: PositiveInt = 64  # steps; each episode is learnt from once
+    batch_size: Count = 64  # steps; each episode is learnt from once
 
 
 class HashCountsBonus(Section):
@@ -96,7 +96,7 @@ class HashCountsBonus(Section):
 
     kind: Literal["hash_counts"]
     bits: int = Field(default=16, ge=1, le=62)  # k; more tell more states apart
-    calibration_states: PositiveInt = 1000  # the first visited; states are hashed in their units
+    calibration_states: Count = 1000  # the first visited; states are hashed in their units
 
 
 class CustomBonus(Section):
@@ -107,7 +107,7 @@ class CustomBonus(Section):
 
     kind: Literal["custom"]
     estimator: Reference
-    arguments: dict[str, Any] = Field(default={})
+    arguments: Arguments = Field(default={})
 
 
 BonusConfig = CuriosityBonus | ICMBonus | RNDBonus | HashCountsBonus | CustomBonus

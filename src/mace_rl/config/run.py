@@ -14,7 +14,7 @@ from pydantic import Field, PositiveInt, model_validator
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.beta import BetaConfig, MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
-from mace_rl.config.section import Section
+from mace_rl.config.section import Arguments, Section
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
@@ -33,8 +33,8 @@ class RunConfig(Section):
     seed: int = Field(ge=0, lt=2**32)
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
-    environment_arguments: dict[str, Any] = Field(default={})  # for the environment's constructor
-    engine: Literal["compiled", "torch"] = "compiled"  # of every network
+    environment_arguments: Arguments = Field(default={})  # for the environment's constructor
+    engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
     memory: MemoryConfig | None = None

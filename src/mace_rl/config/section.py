@@ -1,11 +1,13 @@
 """What every section of the configuration shares: strictness, and one line for a mistake."""
 
 import difflib
+import json
+import math
 import re
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from mace_rl.refusal import Refusal
@@ -25,6 +27,11 @@ class Section(BaseModel):
     )
 
 
+# A number of things, for all of which there may have to be room at once.
+Count = Annotated[int, Field(gt=0, le=10**7)]
+Units = Annotated[int, Field(gt=0, le=10**4)]  # in a layer of a network
+
+
 def _reference(text: str) -> str:
     if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", text):
         raise ValueError("it should name Python code, as package.module:Name")
@@ -33,6 +40,31 @@ def _reference(text: str) -> str:
 
 # Code of the user's own, "package.module:Name"; config/plugins.py says where it is looked for.
 Reference = Annotated[str, AfterValidator(_reference)]
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """With lists for tuples and Python's numbers for NumPy's, as JSON would give it back."""
+    value = value.item() if getattr(value, "shape", None) == () else value
+    if depth < 100 and isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {key: _plain(item, depth + 1) for key, item in value.items()}
+    if depth < 100 and isinstance(value, list | tuple):
+        return [_plain(item, depth + 1) for item in value]
+    finite = not isinstance(value, float) or math.isfinite(value)
+    if finite and (value is None or isinstance(value, bool | int | float | str)):
+        return value
+    raise ValueError(
+        "it should be made of finite numbers, texts, true, false, null, lists and mappings from "
+        "texts, as run.json holds them"
+    )
+
+
+def _writable(values: dict[str, Any]) -> dict[str, Any]:
+    json.dumps(values, ensure_ascii=False).encode()  # ValueError for half a character, and the like
+    return values
+
+
+# Of the user's own code and of environments: what trains is what run.json brings back.
+Arguments = Annotated[dict[str, Annotated[Any, BeforeValidator(_plain)]], AfterValidator(_writable)]
 
 
 def check(model: type[Model], values: Any, origin: str) -> Model:
@@ -68,7 +100,10 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 def short_repr(value: Any) -> str:
     """`repr` of a value, cut to 60 characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # more digits than Python writes
+        text = f"too large: {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -79,7 +114,7 @@ def _advice(problem: ErrorDetails) -> str:
         return " (YAML takes it for text where it stands in quotes)"
     if wanted == "bool_type" and isinstance(value, str):
         return " (write true or false)"
-    text = str(value).replace("_", "")
+    text = str(value).replace("_", "") if isinstance(value, str | float) else ""
     if re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text):
         number = float(text)
         if wanted == "float_type" or (wanted == "int_type" and number.is_integer()):

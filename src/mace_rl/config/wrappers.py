@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from pydantic import Field, PositiveInt, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from mace_rl.config.beta import BetaRule
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import DEFAULTS, merge, read_yaml
-from mace_rl.config.section import Section
+from mace_rl.config.section import Count, Section
 
 
 @cache
@@ -27,7 +27,7 @@ class CuriosityConfig(Section):
     memory: MemoryConfig  # what differs from `defaults`
     novelty: NoveltyConfig  # what likewise
     discount: float = Field(default=0.99, ge=0, le=1)  # γ of the agent
-    rollout_steps: PositiveInt = 1  # steps between updates of the agent; for the bandit
+    rollout_steps: Count = 1  # steps between updates of the agent; for the bandit
     seed: int = Field(default=0, ge=0, lt=2**32)
 
     @model_validator(mode="before")

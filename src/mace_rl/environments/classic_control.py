@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from mace_rl.agent.kernels import act_discrete
-from mace_rl.compiling import njit
+from mace_rl.agent.policy import act_discrete
+from mace_rl.numerics.compiling import njit
 
 CARTPOLE, ACROBOT = 0, 1
 

@@ -3,29 +3,34 @@
 import copy
 import os
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Dict, Tuple
+from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.wrappers import FlattenObservation
 
 from mace_rl.config.plugins import import_module
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
-from mace_rl.environments.spaces import Spaces
+from mace_rl.environments.spaces import Spaces, require_vectors
+from mace_rl.outlets import keep_open
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
+MOST_STEPS = 10**6  # of an episode: before it, noise is drawn for as many
 
 
 @contextmanager
 def nothing_printed() -> Iterator[None]:
     """Keep off the terminal what pybullet prints, from C, when it is loaded and connected."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
+        keep_open(descriptor)
+        with suppress(AttributeError, OSError):  # it is None, or its reader is gone
+            stream.flush()
     kept = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]
     with open(os.devnull, "w") as nowhere:
         for descriptor, _ in kept:
@@ -38,11 +43,27 @@ def nothing_printed() -> Iterator[None]:
             os.close(copy_)
 
 
+@contextmanager
+def trying_out(what: str) -> Iterator[None]:
+    """Turn what an environment raises here into a `ConfigError`, one line; nothing is printed."""
+    try:
+        with nothing_printed():
+            yield
+    except (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled) as error:
+        reason = f"{what} needs a package that should be installed: {error}"
+        raise ConfigError(" ".join(reason.split())) from None
+    except Exception as error:
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        place = "" if frame.f_globals is globals() else f" ({frame.f_code.co_filename}:{line})"
+        reason = f"{what}: {type(error).__name__}: {error}{place}"
+        raise ConfigError(" ".join(reason.split())) from error
+
+
 class Environment(Spaces):
     """A Gymnasium environment with its observation size, time limit and random generator.
 
-    `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id,
-    arguments it does not take, a missing time limit and unsupported spaces.
+    `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id, what
+    cannot be made or reset, a missing time limit and unsupported spaces.
     """
 
     def __init__(
@@ -60,35 +81,52 @@ class Environment(Spaces):
         except gymnasium.error.Error as error:
             raise ConfigError(f"environment {name!r}: {error}") from None
         spec.entry_point = FASTER.get(name, spec.entry_point)
-        spec.max_episode_steps = max_episode_steps or spec.max_episode_steps
-        if spec.max_episode_steps is None:
+        self.max_steps: int = max_episode_steps or spec.max_episode_steps or 0
+        spec.max_episode_steps = self.max_steps
+        if not 1 <= self.max_steps <= MOST_STEPS:
+            found = f"a time limit of {self.max_steps}" if self.max_steps else "no time limit"
             raise ConfigError(
-                f"environment {name!r} has no time limit (max_episode_steps), so its episodes "
-                "need not end; set one"
+                f"environment {name!r} has {found} (max_episode_steps), but whole episodes are "
+                f"kept; set one of 1 to {MOST_STEPS} steps"
             )
-        self.max_steps: int = spec.max_episode_steps
-        with nothing_printed():
-            try:
-                self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
-            except (TypeError, ValueError, LookupError, AssertionError) as error:
-                if not arguments:  # a mistake of its own, whose place the traceback tells
-                    raise
-                reason = " ".join(f"{type(error).__name__}: {error}".split())
-                raise ConfigError(f"environment {name!r} with {arguments}: {reason}") from None
-            except (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled) as error:
-                reason = " ".join(str(error).split())
-                raise ConfigError(
-                    f"environment {name!r} needs a package that should be installed: {reason}"
-                ) from None
+        with trying_out(f"environment {name!r}{f' with {arguments}' if arguments else ''}"):
+            self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
         self.given_space = self.env.observation_space  # that of what it gives, before `encode`
-        if isinstance(self.env.observation_space, Tuple | Dict):
+        if isinstance(self.given_space, Tuple | Dict):
+            require_vectors(name, self.given_space, parts=True)
             self.env = FlattenObservation(self.env)
         super().__init__(name, self.env.observation_space, self.env.action_space)
+        if isinstance(self.action_space, Box) and self.action_space.dtype.kind != "f":
+            raise ConfigError(
+                f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "
+                "policy gives fractions; make them Discrete, or a Box of floats"
+            )
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
         # environment with the same generator state replay an aged one to the bit.
-        with nothing_printed():
-            self.env.reset(seed=int(seed.generate_state(1)[0]))
+        with trying_out(f"environment {name!r}"):
+            given: Any = self.env.reset(seed=int(seed.generate_state(1)[0]))
+            if not (isinstance(given, tuple) and len(given) == 2):
+                raise TypeError(f"reset gave {short_repr(given)}, not (observation, info)")
+            if not isinstance(kept := self.env.unwrapped.np_random, np.random.Generator):
+                raise TypeError(f"np_random is a {type(kept).__name__}, not a Generator of NumPy's")
+
+    def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
+        """Observation, reward and flags that come of an `action`, the `number`th of an episode."""
+        try:
+            observation, reward, terminated, truncated, _ = self.env.step(action)
+        except Exception as error:
+            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+            if frame.f_globals["__name__"].startswith((__name__, "gymnasium.wrappers")):
+                raise ConfigError(
+                    f"environment {self.name!r}, step {number}: not (observation, reward, "
+                    f"terminated, truncated, info): {error}"
+                ) from error
+            error.add_note(f"in step {number} of an episode of {self.name}")
+            raise
+        terminated = bool(self.number("terminated", terminated, number))
+        truncated = bool(self.number("truncated", truncated, number))
+        return observation, self.paid(reward, number), terminated, truncated
 
     @property
     def generator(self) -> np.random.Generator:

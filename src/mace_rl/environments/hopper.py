@@ -21,7 +21,7 @@ from pybullet_envs_gymnasium.gym_locomotion_envs import HopperBulletEnv
 from pybullet_envs_gymnasium.robot_locomotors import Hopper
 from pybullet_envs_gymnasium.scene_stadium import SinglePlayerStadiumScene
 
-from mace_rl.compiling import njit
+from mace_rl.numerics.compiling import njit
 
 VERIFIED = {"pybullet": "3.2.7", "pybullet_envs_gymnasium": "0.6.0"}
 # Pybullet's numbers of the robot's parts, in the order in which the library averages positions.

@@ -4,7 +4,6 @@
 which gives the same episode to the bit. Callers cannot tell which one ran.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +15,7 @@ from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 from mace_rl.agent.policy import ActingPolicy, CompiledActing
 from mace_rl.environments import classic_control
 from mace_rl.environments.environment import Environment
-from mace_rl.finite import require_finite
+from mace_rl.numerics.finite import TOO_LARGE, require_finite
 
 COMPILED = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}  # what the compiled loop plays
 
@@ -49,42 +48,32 @@ def draw_noise(environment: Environment, generator: np.random.Generator) -> np.n
 
 def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
     """Play one episode by stepping the environment; see `Episode`."""
-    env = environment.env
     space: Any = environment.action_space  # Discrete or Box
     discrete = isinstance(space, gymnasium.spaces.Discrete)
     observations = np.empty((len(noise) + 1, environment.observation_size), np.float32)
     actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
     log_probs = np.empty(len(noise), np.float32)
     rewards = np.empty(len(noise))
-    observation, _ = env.reset()
     vector = observations[0]
-    vector[:] = environment.encode(observation)
-    require_finite("the observation", vector, " after the reset")
+    vector[:] = environment.encode(environment.env.reset()[0], 0)
     terminated = truncated = False
     t = 0
     while not (terminated or truncated):
         action: Any
         action, log_prob = policy.act(vector, noise[t])
         env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
-        try:
-            observation, reward, terminated, truncated, _ = env.step(env_action)
-        except Exception as error:
-            error.add_note(f"in step {t + 1} of an episode of {environment.name}")
-            raise
+        observation, reward, terminated, truncated = environment.step(env_action, t + 1)
         actions[t], log_probs[t], rewards[t] = action, log_prob, reward
         t += 1
         vector = observations[t]
-        vector[:] = environment.encode(observation)
-        if not (math.isfinite(reward) and math.isfinite(vector.sum())):
-            require_finite("the reward", float(reward), f" after step {t}")
-            require_finite("the observation", vector, f" after step {t}")
+        vector[:] = environment.encode(observation, t)
     # Copies: an episode that ended early should not hold the memory of a whole one.
     return Episode(
         observations=observations[: t + 1].copy(),
         actions=actions[:t].copy(),
         log_probs=log_probs[:t].copy(),
         rewards=rewards[:t].copy(),
-        terminated=bool(terminated),
+        terminated=terminated,
     )
 
 
@@ -96,11 +85,13 @@ def roll_out_compiled(
     inner: Any = environment.env.unwrapped
     cartpole = isinstance(inner, CartPoleEnv)
     which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
-    return Episode(
+    episode = Episode(
         *classic_control.episode(
             which, np.array(inner.state, np.float64), observation, policy, noise
         )
     )
+    require_finite("an observation", episode.observations, too_large=TOO_LARGE)
+    return episode
 
 
 def rollout_for(

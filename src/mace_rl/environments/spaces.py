@@ -1,12 +1,19 @@
-"""What the spaces of an environment mean here: observations are vectors."""
+"""What the spaces of an environment mean here: observations are vectors.
+
+And what an environment gives is checked here, as it comes in.
+"""
 
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, short_repr
+from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
+
+MOST_NUMBERS = 10**6  # in an observation or an action: every network has a row for each
+NUMBERS = "biuf"  # NumPy's kinds of them
 
 
 class Spaces:
@@ -19,53 +26,100 @@ class Spaces:
     def __init__(
         self, name: str, observations: gymnasium.Space[Any], actions: gymnasium.Space[Any]
     ) -> None:
-        if not isinstance(observations, Box | Discrete) or _is_image(observations):
-            raise ConfigError(
-                f"environment {name!r} has {_kind(observations)} observations, {observations}; "
-                "Box (vectors) and Discrete ones work"
-            )
+        require_vectors(name, observations)
         if not (
-            isinstance(actions, Discrete) or (isinstance(actions, Box) and actions.shape[1:] == ())
+            isinstance(actions, Discrete) or (isinstance(actions, Box) and len(actions.shape) == 1)
         ):
             raise ConfigError(
                 f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box work"
             )
+        require_size(name, actions)
+        assert isinstance(observations, Box | Discrete)
         self.name = name
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
-        self.observation_size = (
-            int(observations.n)
-            if isinstance(observations, Discrete)
-            else int(np.prod(observations.shape))
-        )
+        self.observation_size = int(gymnasium.spaces.flatdim(observations))
+        self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
 
-    def encode(self, observation: Any) -> np.ndarray:
+    def encode(self, observation: Any, step: int | None = None) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]; may be the same memory.
 
-        Raises `ConfigError` for what is not of the space.
+        step: after which it came, for messages; 0 is the reset. Raises `ConfigError` for what is
+        not of the space, and `NonFiniteError` for numbers that nothing can be learned from.
         """
-        space = self.observation_space
+        space, given = self.observation_space, np.asarray(observation)
         if isinstance(space, Discrete):
-            number, found = int(observation) - int(space.start), f"number {observation}"
-            if 0 <= number < self.observation_size:
+            number = _only(given)
+            place = -1 if number is None or number % 1 else int(number) - int(space.start)
+            if 0 <= place < self.observation_size:
                 vector = np.zeros(self.observation_size, np.float32)
-                vector[number] = 1.0
+                vector[place] = 1.0
                 return vector
-        else:
-            vector = np.asarray(observation, np.float32)
-            if vector.size == self.observation_size:
-                return vector.ravel()
-            found = f"shape {vector.shape}"
+        elif given.size == self.observation_size and given.dtype.kind in NUMBERS:
+            vector = given.ravel()
+            if vector.dtype != np.float32:
+                with np.errstate(over="ignore"):  # what becomes infinite is found in the next line
+                    vector = vector.astype(np.float32)
+            if not all_below(vector, TOO_LARGE):
+                require_finite("the observation", given.astype(float), _after(step), TOO_LARGE)
+            return vector
         raise ConfigError(
-            f"environment {self.name!r} gave an observation of {found}, but its "
-            f"observation_space is {space}"
+            f"environment {self.name!r} gave the observation {short_repr(observation)} of shape "
+            f"{given.shape}{_after(step)}, but its observation_space is {space}"
+        )
+
+    def number(self, what: str, value: Any, step: int) -> float:
+        """A reward or a flag that came of a step, counted from 1; `ConfigError` if it is neither.
+
+        Arrays of one are taken for what is in them.
+        """
+        if type(value) is float or type(value) is bool:
+            return value
+        if (found := _only(np.asarray(value))) is None:
+            raise ConfigError(
+                f"environment {self.name!r} gave {short_repr(value)} as {what}{_after(step)}, but "
+                "it should be one number, or True or False"
+            )
+        return found
+
+    def paid(self, reward: Any, step: int) -> float:
+        """The reward of a step, checked."""
+        number = float(self.number("reward", reward, step))
+        require_finite("the reward", number, _after(step), TOO_LARGE)
+        return number
+
+
+def require_vectors(name: str, space: gymnasium.Space[Any], parts: bool = False) -> None:
+    """Raise `ConfigError` for observations that are no vectors; parts: of a Dict or Tuple."""
+    if parts and isinstance(space, Dict | Tuple) and len(space):
+        for part in space.values() if isinstance(space, Dict) else space:
+            require_vectors(name, part, parts=True)
+        return
+    works = (Box, Discrete, MultiBinary, MultiDiscrete) if parts else (Box, Discrete)
+    image = isinstance(space, Box) and len(space.shape) >= 2 and space.dtype == np.uint8
+    if image or not isinstance(space, works):
+        kind = "image" if image else type(space).__name__.lower()
+        raise ConfigError(
+            f"environment {name!r} has {kind} observations, {space}; Box (vectors) and Discrete "
+            "ones work"
+        )
+    require_size(name, space)
+
+
+def require_size(name: str, space: gymnasium.Space[Any]) -> None:
+    """Raise `ConfigError` for a space of vectors without, or with too many numbers."""
+    size = int(gymnasium.spaces.flatdim(space))
+    if not 1 <= size <= MOST_NUMBERS:
+        raise ConfigError(
+            f"environment {name!r} has {size} numbers in {short_repr(space)}; 1 to"
+            f" {MOST_NUMBERS} work"
         )
 
 
-def _is_image(space: gymnasium.Space[Any]) -> bool:
-    return isinstance(space, Box) and len(space.shape) >= 2 and space.dtype == np.uint8
+def _only(values: np.ndarray) -> Any:
+    """The number in an array of one; None where there is none, or are more."""
+    return values.item() if values.size == 1 and values.dtype.kind in NUMBERS else None
 
 
-def _kind(space: gymnasium.Space[Any]) -> str:
-    """What a space that does not work is called."""
-    return "image" if _is_image(space) else type(space).__name__.lower()
+def _after(step: int | None) -> str:
+    return "" if step is None else f" after step {step}" if step else " after the reset"

@@ -11,20 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, Independent, Normal
+from torch.distributions import Distribution
 
 from mace_rl import files
-from mace_rl.agent import kernels
-from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing, Policy
+from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
+from mace_rl.agent.ppo import PPO
+from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.config.plugins import config_of_run
 from mace_rl.environments.environment import Environment
+from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError, unarchive
 from mace_rl.runs.observations import encoded
 from mace_rl.runs.provenance import file_digest, read_record
 from mace_rl.trainer import Trainer
 
 
-class PolicyModule(torch.nn.Module):
+class PolicyModule(TorchPolicy):
     """π(·|s) for observations as the environment gives them: `mace_rl.runs.observations`."""
 
     mean: Tensor
@@ -32,16 +34,12 @@ class PolicyModule(torch.nn.Module):
     clip: Tensor
 
     def __init__(self, trainer: Trainer) -> None:
-        super().__init__()
+        super().__init__(trainer.ppo.policy)
         ppo, self.space = trainer.ppo, trainer.environment.given_space
-        self.network = ppo.policy.network.module()
-        self.discrete = ppo.policy.discrete
-        if not self.discrete:
-            self.log_std = torch.nn.Parameter(torch.from_numpy(ppo.policy.log_std.copy()))
         mean, std, clip = ppo.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
-        self.register_buffer("clip", torch.tensor(clip, dtype=torch.float64))
+        self.register_buffer("clip", torch.from_numpy(np.array(clip)))
 
     def forward(self, observations: Any) -> Distribution:
         """The distribution over actions in each state; observations: one, or a batch of them.
@@ -51,10 +49,7 @@ class PolicyModule(torch.nn.Module):
         """
         rows = encoded(observations, self.space, len(self.mean)).to(self.mean.device)
         seen = ((rows - self.mean) / self.std).clip(-self.clip, self.clip).float()
-        outputs = self.network(seen)
-        if self.discrete:
-            return Categorical(logits=outputs)
-        return Independent(Normal(outputs, self.log_std.exp()), 1)
+        return super().forward(seen)
 
 
 class Agent(torch.nn.Module):
@@ -74,10 +69,7 @@ class MostProbable(NetworkActing):
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """See `ActingPolicy`; the noise does not matter."""
-        seen = np.empty_like(self.mean)
-        kernels.normalise(observation, self.mean, self.inverse_std, self.clip, seen)
-        with torch.no_grad():
-            outputs = self.policy.network.forward(seen[None]).outputs
+        outputs = self.outputs(observation)
         action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]
         return action, self.policy.log_probs(outputs, np.array([action]))[0]
 
@@ -101,20 +93,16 @@ def load_acting(
     if not policy.discrete:
         policy.log_std[:] = loaded.log_std.detach().numpy()
     mean, std, clip = loaded.mean.numpy(), loaded.std.numpy(), float(loaded.clip)
-    return trainer.environment, acting(policy, mean, std, clip, deterministic)
+    return trainer.environment, acting(
+        trainer.ppo, Normalisation.of(mean, std, clip), deterministic
+    )
 
 
-def acting(
-    policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float, deterministic: bool
-) -> ActingPolicy:
-    """The policy for rollouts, with observation normalisation in front of it.
-
-    It samples its actions, or if `deterministic` takes the most probable ones.
-    """
-    if not deterministic:
-        return policy.for_acting(mean, std, clip)
-    unit = (1.0 / std).astype(np.float32)
-    return MostProbable(policy, mean.astype(np.float32), unit, np.float32(clip))
+def acting(ppo: PPO, normalisation: Normalisation, deterministic: bool) -> ActingPolicy:
+    """The policy for rollouts: it samples its actions, or takes the most probable ones."""
+    if deterministic:
+        return MostProbable(ppo.policy, normalisation)
+    return ppo.learner.acting(normalisation)
 
 
 def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:

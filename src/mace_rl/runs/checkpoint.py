@@ -7,13 +7,18 @@ it belongs to (configuration, code, versions); one of another identity is never 
 import hashlib
 import io
 import zipfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mace_rl.config.section import short_repr
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
+
+TENSORS = (torch.Tensor, torch.nn.Parameter)
+PLAIN = (*TENSORS, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
 
 
 class CheckpointError(Refusal, ValueError):
@@ -45,23 +50,22 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
 
 
+def require_plain(value: Any, place: str) -> None:
+    """`CheckpointError` that names the `place` of what `unarchive` would not read again."""
+    if type(value) not in PLAIN:
+        right = "a tensor, number, text, list or dict, to be read without executing anything"
+        raise CheckpointError(f"{place} is {short_repr(value)}, but should be {right}")
+    pairs = value.items() if isinstance(value, dict) else ()
+    for key, item in enumerate(value) if isinstance(value, list | tuple) else pairs:
+        require_plain(key, f"a key of {place}")
+        require_plain(item, f"{place}.{key}")
+
+
 def save(path: Path, identity: dict[str, Any], state: dict[str, Any]) -> None:
-    """Write a checkpoint of the run with this `identity`."""
+    """Write a checkpoint of the run with this `identity`; `CheckpointError` if it is not plain."""
+    require_plain(state, "state")
     data = archive({"identity": identity, "state": state})
     write_atomically(path, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
-
-
-def load(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """The state in a checkpoint.
-
-    Raises `CheckpointError` if the file is cut off or altered, or if its identity is not
-    `identity`; the message then names what differs.
-    """
-    content = read(path)
-    found = content["identity"]
-    if found != identity:
-        raise CheckpointError(f"{path}: of another run: {difference(found, identity)}")
-    return content["state"]
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mace_rl.agent.advantages import total
 from mace_rl.environments.rollout import draw_noise, rollout_for
+from mace_rl.numerics.arrays import total
 from mace_rl.runs.agent import load_acting
 
 

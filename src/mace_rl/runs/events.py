@@ -28,8 +28,7 @@ def write_all(folder: Path, out: Path) -> int:
     Returns how many runs there are. Raises `RecordError` if there are none, or for damaged records,
     and `Refusal` without tensorboardX.
     """
-    names = (files.RECORD, files.CHECKPOINT)
-    runs = sorted({path.parent for name in names for path in folder.rglob(name)})
+    runs = files.runs_below(folder, [files.RECORD, files.CHECKPOINT])
     if not runs:
         raise RecordError(f"{folder}: no run in it, finished or with a checkpoint")
     for run in runs:

@@ -27,7 +27,7 @@ def columns(folder: Path) -> dict[str, list[Any]]:
     """
     table: dict[str, list[Any]] = {name: [] for name in (*RUN, *EPISODE)}
     seen: dict[tuple[Any, ...], Path] = {}
-    for run in sorted(path.parent for path in folder.rglob(files.RECORD)):
+    for run in files.runs_below(folder, [files.RECORD]):
         record, episodes = read_record(run / files.RECORD), run / files.EPISODES
         key = tuple(record["config"][name] for name in ("environment", "variant", "seed"))
         if key in seen:
@@ -48,10 +48,12 @@ def columns(folder: Path) -> dict[str, list[Any]]:
 
 def write(table: dict[str, list[Any]], out: Path) -> None:
     """Write the table as `out` ends: .csv or .parquet; `Refusal` without pyarrow for the latter."""
+    header = ",".join(table)
+    files.require_ours(out, header.encode() if out.suffix == ".csv" else b"PAR1")
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".csv":
         lines = (",".join(map(str, row)) for row in zip(*table.values(), strict=True))
-        write_atomically(out, "\n".join([",".join(table), *lines, ""]))
+        write_atomically(out, "\n".join([header, *lines, ""]))
         return
     try:
         import pyarrow

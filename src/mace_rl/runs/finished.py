@@ -2,13 +2,15 @@
 
 import csv
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from mace_rl import files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_rl.runs.provenance import file_digest, read_record
 from mace_rl.runs.records import EpisodeRecord
+
+WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
 
 def read_rows(path: Path) -> list[EpisodeRecord]:
@@ -27,23 +29,28 @@ def finished(config: RunConfig, directory: Path) -> bool:
     """
     if not (directory / files.RECORD).exists():
         return False
-    way_out = "choose another folder, or remove this one"
     content = read_record(directory / files.RECORD)
     # PyTorch takes seconds.
-    from mace_rl.runs.checkpoint import difference
     from mace_rl.runs.run import run_identity
 
     wanted = run_identity(config)
     found = {key: content[key] for key in wanted}
     found["config"] = check(RunConfig, found["config"], str(directory / files.RECORD)).settings()
     if found != wanted:
-        code = " or ".join([*config.references().values(), "mace_rl"])
-        only_code = found | {"sources": wanted["sources"]} == wanted
-        other = f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"
-        raise ConfigError(f"{directory} holds a finished run {other}; {way_out}")
+        what = f"a finished run {otherwise(found, wanted, config)}"
+        raise ConfigError(f"{directory} holds {what}; {WAY_OUT}")
     for path in (directory / name for name in files.RESULTS):
         if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
             raise ConfigError(
-                f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {way_out}"
+                f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {WAY_OUT}"
             )
     return True
+
+
+def otherwise(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
+    """In words, how the run with the identity `found` differs from the `wanted` one of `config`."""
+    from mace_rl.runs.checkpoint import difference
+
+    code = " or ".join([*config.references().values(), "mace_rl"])
+    only_code = found | {"sources": wanted["sources"]} == wanted
+    return f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"

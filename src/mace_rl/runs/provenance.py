@@ -30,6 +30,10 @@ PACKAGES = (
 KEYS = {"config", "versions", "sources", "machine", "outputs"}
 
 
+class GitError(Refusal, RuntimeError):
+    """What git cannot do; the message is its reason."""
+
+
 class ProvenanceError(Refusal, ValueError):
     """A `run.json` that cannot be trusted; the message names it."""
 
@@ -55,19 +59,34 @@ def versions() -> dict[str, str]:
 
 
 def git_state() -> dict[str, Any]:
-    """Commit and whether tracked files differ from it; both None outside a git checkout."""
+    """Commit of this package's own checkout and whether tracked files differ from it.
 
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(sources.PACKAGE), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
+    Both None where it is in none, or in somebody else's; "reason" then says why.
+    """
+    root = sources.PACKAGE.resolve().parents[1]
     try:
+        git(root, "ls-files", "--error-unmatch", "src/mace_rl/runs/provenance.py")
         return {
-            "commit": git("rev-parse", "HEAD"),
-            "dirty": bool(git("status", "--porcelain", "--untracked-files=no")),
+            "commit": git(root, "rev-parse", "HEAD").decode().strip(),
+            "dirty": bool(git(root, "status", "--porcelain", "--untracked-files=no")),
         }
-    except (FileNotFoundError, subprocess.CalledProcessError):  # no git, or no repository
-        return {"commit": None, "dirty": None}
+    except (FileNotFoundError, GitError) as error:  # no git, or none of ours
+        return {"commit": None, "dirty": None, "reason": str(error)}
+
+
+def git(root: Path, *arguments: str) -> bytes:
+    """What git prints in the checkout `root`, whatever GIT_DIR and the like say, and who owns it.
+
+    Raises `GitError` with git's reason, also where `root` is only inside a checkout.
+    """
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    variables |= {"GIT_CEILING_DIRECTORIES": str(root.parent), "LC_ALL": "C"}
+    command = ["git", "-C", str(root), "-c", f"safe.directory={root}"]
+    command += ["-c", "core.fsmonitor=false"]  # a command that the repository names
+    run = subprocess.run([*command, *arguments], capture_output=True, env=variables)
+    if run.returncode:
+        raise GitError(" ".join(run.stderr.decode(errors="replace").split()))
+    return run.stdout
 
 
 def peak_memory_mb() -> float:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (numba loads it: before threads are limited)
@@ -24,11 +24,13 @@ from threadpoolctl import threadpool_limits
 
 from mace_rl import files
 from mace_rl.config.run import RunConfig
+from mace_rl.environments import resuming
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
+from mace_rl.runs.finished import WAY_OUT, finished, otherwise
 from mace_rl.runs.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.trainer import Trainer
 
@@ -41,6 +43,7 @@ CHECKPOINT_SECONDS, CHECKPOINT_VARIABLE = 10.0, "MACE_RL_CHECKPOINT_SECONDS"
 CHECKPOINT_COST = 0.01
 # A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
 LOCK_SECONDS = 5.0
+CLAIM = b"mace-rl trains here\n"  # in the lock's file: a run's files beside it are its own
 
 
 class RunError(Refusal, RuntimeError):
@@ -53,29 +56,36 @@ def run(
     observe: Callable[[dict[str, Any]], None] | None = None,
     keep_checkpoint: bool = False,
     after_episode: Callable[[EpisodeRecord], object] | None = None,
+    aside: Literal["nothing", "others", "all"] = "nothing",
 ) -> None:
     """Train as `config` says and leave its results in `directory`.
 
     Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`; and
     `after_episode` each episode, when the update that it was played for is done.
 
-    Continues from its checkpoint if there is one of this very configuration, code and versions;
-    otherwise says so in the log and starts afresh. With `keep_checkpoint` a last one stays, from
-    which results that are deleted come back without training. Uses one thread. Raises `RunError`
-    if another process is at work in `directory`.
+    Continues from its checkpoint if there is one of this very configuration, code and versions,
+    and does nothing where this run is finished. Anything else that is in the way is refused, or
+    moved into a folder below `directory`: "others" than this run, or "all", to start afresh.
+
+    With `keep_checkpoint` a last one stays, from which results that are deleted come back without
+    training. Uses one thread. Raises `RunError` if another process is at work in `directory` or
+    something is in the way, `ConfigError` if a finished run is.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    with exclusive(directory), threadpool_limits(1), left_alone():
-        for half_written in directory.glob(".*.tmp"):  # by a process that was killed
-            half_written.unlink()
+    with exclusive(directory) as lock, threadpool_limits(1), left_alone():
+        if aside == "nothing" and finished(config, directory):
+            (directory / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
+            return
         started = time.monotonic()
+        identity = run_identity(config)
         trainer = Trainer(config)
+        state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # what is there stays: the collector need not look through it again
-        identity = run_identity(config)
-        before, saving, interruptions = resume(trainer, directory / files.CHECKPOINT, identity)
+        before, saving, interruptions = resume(trainer, state)
+        checkpoint.require_plain(trainer.state_dict(), "state")  # not when it is late
         progress_seconds = OBSERVER_SECONDS if observe else PROGRESS_SECONDS
         clock = Clock(started - before, progress_seconds, saving)
         observe = observe or partial(write_progress, directory)
@@ -119,24 +129,68 @@ def run_identity(config: RunConfig) -> dict[str, Any]:
     }
 
 
+def to_continue(
+    config: RunConfig, identity: dict[str, Any], directory: Path, lock: int, aside: str
+) -> dict[str, Any] | None:
+    """The state to continue from; None to start afresh. From then on the folder is a run's.
+
+    `lock` is its open lock file, which says so: what nobody knows to be a training's is refused.
+    See `run` for what becomes of anything else. Raises `RunError` for what is refused.
+    """
+    path, content = directory / files.CHECKPOINT, None
+    trained_here = os.pread(lock, len(CLAIM), 0) == CLAIM
+    harmless = {files.PROGRESS} if trained_here else set()
+    there = [name for name in files.OF_A_RUN if os.path.lexists(directory / name)]
+    others = not trained_here and files.RECORD not in there
+    reason = f"{directory} holds {', '.join(there)}" + ", which no training left" * others
+    if path.exists():
+        try:
+            content = checkpoint.read(path)
+            others = content["identity"] != identity
+            other = f" {otherwise(content['identity'], identity, config)}" if others else ""
+            reason = f"{directory} holds an unfinished run{other}"
+        except checkpoint.CheckpointError as error:
+            reason = str(error)
+    if (content is None or others or aside == "all") and set(there).difference(harmless):
+        if others and aside == "nothing":
+            raise RunError(f"{reason}; {WAY_OUT}")
+        moved = files.set_aside(directory, there)
+        logger.warning("starting afresh: %s; set aside in %s", reason, moved)
+        content = None
+    if trained_here or path.exists():
+        for name in files.OF_A_RUN:  # half written by a process that was killed
+            for half_written in directory.glob(f".{name}.[0-9]*.tmp"):
+                half_written.unlink()
+    if not os.fstat(lock).st_size:
+        os.write(lock, CLAIM)
+    return content["state"] if content else None
+
+
 def resume(
-    trainer: Trainer, path: Path, identity: dict[str, Any]
+    trainer: Trainer, state: dict[str, Any] | None
 ) -> tuple[float, float, list[dict[str, Any]]]:
-    """Continue from the checkpoint at `path`, if it is this run's.
+    """Continue from the state in a checkpoint, if there is one.
 
     Returns the seconds already spent, those of them on checkpoints, and for each interruption so
-    far the episode after which the run was continued and the machine that had done the part before.
+    far the episode after which the run was continued, the machine that had done the part before,
+    and whether the environment played the last episodes before it again, as it should.
     """
-    if not path.exists():
+    if state is None:
         return 0.0, 0.0, []
-    try:
-        state = checkpoint.load(path, identity)
-    except checkpoint.CheckpointError as error:
-        logger.warning("starting afresh: %s", error)
-        return 0.0, 0.0, []
-    trainer.load_state_dict(state["trainer"])
+    differs = resuming.replay_differs(trainer.environment, state["trainer"]["last_episodes"])
+    trainer.load_state_dict(state["trainer"])  # also what the replay drew from
     logger.info("resuming after episode %d", len(trainer.records))
-    interruption = {"after_episode": len(trainer.records), "machine": state["machine"]}
+    if differs:
+        logger.warning(
+            "%s plays its last episodes otherwise than before the interruption (%s), by state "
+            "that the checkpoint has not: this run is not the one that it would have been",
+            *(trainer.config.environment, differs),
+        )
+    interruption = {
+        "after_episode": len(trainer.records),
+        "machine": state["machine"],
+        "environment_replayed": not differs,
+    }
     interruptions = [*state["interruptions"], interruption]
     return state["seconds"], state["checkpoint_seconds"], interruptions
 
@@ -204,19 +258,18 @@ def left_alone() -> Iterator[None]:
 
 
 @contextmanager
-def exclusive(directory: Path) -> Iterator[None]:
-    """Hold the run's folder for this process; the lock goes with the process, however it ends."""
+def exclusive(directory: Path) -> Iterator[int]:
+    """Hold the run's folder for this process, by a file; the lock goes with the process."""
     # A file of its own: a folder on a network's disk can be locked by two machines at once.
-    descriptor = os.open(directory / files.LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
+    with open(directory / files.LOCK, "a+b") as file:
+        # A copy in an environment's worker would hold it when the training has ended.
+        os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
-        while not locked(descriptor):
+        while not locked(file.fileno()):
             if time.monotonic() > patience:
                 raise RunError(f"{directory}: another process is training in this folder")
             time.sleep(0.1)
-        yield
-    finally:
-        os.close(descriptor)
+        yield file.fileno()
 
 
 def locked(descriptor: int) -> bool:

@@ -23,10 +23,10 @@ class NotReproducedError(Refusal):
 
 
 def reference_runs(folder: Path) -> list[Path]:
-    """The run folders below `folder`, sorted; `RecordError` if there are none."""
-    runs = sorted(path.parent for path in folder.glob("runs/*/*/seed*/run.json"))
+    """The run folders in and below `folder`, sorted; `RecordError` if there are none."""
+    runs = files.runs_below(folder, [files.RECORD])
     if not runs:
-        raise RecordError(f"{folder}: no runs/ENVIRONMENT/VARIANT/seedN/run.json in it")
+        raise RecordError(f"{folder}: no finished run in it")
     return runs
 
 

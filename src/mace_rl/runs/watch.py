@@ -17,6 +17,7 @@ from mace_rl.config.plugins import config_of_run
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
 from mace_rl.environments.rollout import draw_noise, roll_out
+from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.agent import acting, load_acting
 from mace_rl.runs.provenance import read_record
 from mace_rl.trainer import Trainer
@@ -81,7 +82,10 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _take(self) -> None:
         try:
-            drawn = Image.fromarray(np.asarray(self.env.render(), np.uint8))
+            rendered = self.env.render()
+            if rendered is None:
+                raise TypeError("render() gives no picture")
+            drawn = Image.fromarray(np.asarray(rendered, np.uint8))
         except Exception as error:  # renderers fail by many types: no display, no library, a bug
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise RenderError(f"environment {self.name!r} cannot be drawn: {reason}") from error
@@ -116,7 +120,7 @@ def film(
     if untrained:
         trainer = Trainer(config)
         environment, ppo = trainer.environment, trainer.ppo
-        policy = acting(ppo.policy, *ppo.normalisation(), deterministic)
+        policy = acting(ppo, Normalisation.of(*ppo.normalisation()), deterministic)
     else:
         environment, policy = load_acting(directory, deterministic, trust)
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.

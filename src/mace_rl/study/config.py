@@ -48,8 +48,9 @@ def _folder(path: str) -> str:
     if max(map(len, path.encode().split(b"/"))) > 255:
         raise ValueError("its names should be of at most 255 bytes")
     for part in (Path(path), *Path(path).parents):
-        if part.exists() and not part.is_dir():
-            raise ValueError(f"it should be a folder, and {part} is a file")
+        if not part.is_dir() and (part.exists() or part.is_symlink()):
+            found = "file" if part.exists() else "link that leads nowhere"
+            raise ValueError(f"it should be a folder, and {part} is a {found}")
     return path
 
 

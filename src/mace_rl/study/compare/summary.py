@@ -43,8 +43,8 @@ def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) 
                     "paper": table1.value(str(environment), str(variant), metric.name),
                 }
             )
-    frame = pd.DataFrame(rows)
-    return frame.assign(paper=frame["paper"].astype(object).convert_dtypes())  # 186, not 186.0
+    fractions = any(isinstance(row["paper"], float) for row in rows)
+    return pd.DataFrame(rows).astype({"paper": "Float64" if fractions else "Int64"})
 
 
 def split(means: pd.DataFrame, table1: Table1Config) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
 DASH = "\u2013"  # in the place of a number that there is not
 
 

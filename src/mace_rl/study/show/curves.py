@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # imported where they are used: planning the workflow does wi
 MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
-LETTERS = 120  # about as many as stand side by side in a legend
+LETTERS = 140  # about as many as stand side by side in a legend
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
 HIDDEN = 0.01  # of what all means span: lines so near to each other are one to the eye

@@ -10,9 +10,8 @@ from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
 from mace_rl.study.compare.summary import from_to
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
-from mace_rl.study.show.cells import DASH, Cell
+from mace_rl.study.show.cells import COLUMNS_PER_BLOCK, DASH, Cell
 
-COLUMNS_PER_BLOCK = 3  # side by side; more continue below
 INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
 
 _LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones

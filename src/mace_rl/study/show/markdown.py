@@ -1,10 +1,10 @@
-"""Pages of Markdown, such as claims.md and tables.md: a title, pictures, sections."""
+"""Tables as text: pages of Markdown, such as claims.md and tables.md, and for the terminal."""
 
 from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from mace_rl.study.show.cells import Cell
+from mace_rl.study.show.cells import COLUMNS_PER_BLOCK, Cell
 from mace_rl.study.show.sections import Section
 
 
@@ -32,3 +32,21 @@ def _markdown(cell: str | Cell) -> str:
     intervals = [f"{one.low} to {one.high}" for one in cell.values if one.low]
     interval = f" ({cell.joint.join(intervals)})" if intervals else ""
     return cell.joint.join(texts) + interval + (f"; {cell.note}" if cell.note else "")
+
+
+def plain(frame: pd.DataFrame) -> str:
+    """A table for the terminal, without intervals; the best have a star."""
+    head, *names = frame.columns
+    blocks = []
+    for start in range(0, len(names), COLUMNS_PER_BLOCK):
+        part = frame[[head, *names[start : start + COLUMNS_PER_BLOCK]]]
+        rows = [list(part.columns), *([_plain(cell) for cell in row] for row in part.to_numpy())]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        blocks.append("\n".join("   ".join(map(str.ljust, row, widths)).rstrip() for row in rows))
+    return "\n\n".join(blocks)
+
+
+def _plain(cell: str | Cell) -> str:
+    if isinstance(cell, str):
+        return cell
+    return cell.joint.join(f"{one.text}{one.mark}{'*' if one.best else ''}" for one in cell.values)

@@ -36,7 +36,6 @@ OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is na
     "max_gradient_norm": "Maximal Gradient Norm",
     "normalise_observations": "Normalised Observations",
     "entropy_coefficient": "Entropy Coefficient",
-    "critic": "Critic",
     "scale_rewards": "Rewards over the Deviation of their Discounted Sums",
     "scale_advantages": "Advantages over their Root Mean Square, by Kind of Reward",
     "smallest_advantage": "Smallest Scale of Extrinsic Advantages",

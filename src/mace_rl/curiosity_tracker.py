@@ -1,7 +1,6 @@
 """Curiosity while an episode is played: what `mace_rl.wrappers` ask of it, step by step."""
 
 import copy
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +19,7 @@ from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
-from mace_rl.finite import require_finite, require_share
+from mace_rl.numerics.finite import require_within
 from mace_rl.streams import Streams
 
 # What a step's `info` gets, float.
@@ -35,7 +34,7 @@ class Recording:
     """An episode that goes on: what was played, what it was worth, and at which rates."""
 
     beta: float
-    unit: float  # see `Appraisal.unit`
+    unit: float  # see `CuriosityTracker.unit`
     visits: np.ndarray  # to each Discrete state so far, [observation]; of Box ones 0
     observations: list[np.ndarray]  # the first, and what each step led to, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
@@ -50,7 +49,7 @@ class Recording:
 
     def state_dict(self) -> dict[str, Any]:
         """Each part as a tensor."""
-        return {name: torch.tensor(np.array(part)) for name, part in vars(self).items()}
+        return {name: torch.from_numpy(np.array(part)) for name, part in vars(self).items()}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Recording":
@@ -60,7 +59,7 @@ class Recording:
         return cls(*numbers, *(list(parts[name]) for name in LISTS))
 
 
-class Appraisal:
+class CuriosityTracker:
     """Appraises episodes of several environments while they go on."""
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
@@ -68,7 +67,7 @@ class Appraisal:
         streams = Streams(config.seed)
         space, size = spaces.observation_space, spaces.observation_size
         memory = config.memory if config.relevance else None
-        self.curiosity = Curiosity(memory, config.novelty, "compiled", space, size, streams)
+        self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
         self.controller = beta_rule(config.beta, config.rollout_steps, streams["beta"])
         if isinstance(config.beta, CustomBeta) and self.controller.learns:
             raise ConfigError(
@@ -92,24 +91,24 @@ class Appraisal:
 
     def begin(self, environment: int, observation: Any) -> None:
         """An episode begins; what was played of another is forgotten."""
-        first, beta = np.array(self.spaces.encode(observation)), self.controller.beta
-        require_share("β", beta)
+        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
+        require_within("β", beta)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
-    def pay(
-        self, environment: int, action: Any, reward: float, observation: Any
+    def reward_parts(
+        self, environment: int, action: Any, reward: Any, observation: Any
     ) -> dict[str, float]:
         """`PARTS` of the reward for a step; reward: the extrinsic one; then what it led to."""
         recording, space = self.recordings[environment], self.spaces.action_space
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        if not math.isfinite(reward):
-            require_finite("the reward", reward, f" after step {len(recording.rewards) + 1}")
-        state = np.array(self.spaces.encode(observation))  # a copy
+        step = len(recording.rewards) + 1
+        reward = self.spaces.paid(reward, step)
+        state = np.array(self.spaces.encode(observation, step))  # a copy
         found = self.curiosity.appraise(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
-            require_share("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
+            require_within("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
             bonus = max(bonus, 0.0)
         if self.spaces.discrete_observations:
             recording.visits += state
@@ -130,7 +129,6 @@ class Appraisal:
         assert recording is not None
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
-        require_finite("an observation", episode.observations)
         for scale, rewards in zip(self.scales, (episode.rewards, bonus), strict=True):
             scale.update(rewards)
         values = np.zeros(len(episode) + 1)  # with λ = 1 only rewards are left: no critic
@@ -145,7 +143,7 @@ class Appraisal:
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 2,  # of the state itself
+            "form": 3,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

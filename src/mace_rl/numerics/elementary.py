@@ -14,8 +14,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from mace_rl.compiling import njit
+from mace_rl.numerics.compiling import kernel
 
+HALF_LOG_TAU = 0.9189385332046727  # log √(2π)
 f32 = np.float32
 
 
@@ -56,7 +57,7 @@ def float_of(context: Any, bits: Any) -> Any:
     return types.float32(types.int32), codegen
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def tanh(x):
     """Hyperbolic tangent, to 2e-7.
 
@@ -74,7 +75,7 @@ def tanh(x):
 ROUNDING = f32(1.5 * 2**23)  # added to a small number, it leaves no digits after the point
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def exp(x):
     """eˣ, to 1 unit in the last place; Inf above 88.72, 0 below -103.97.
 
@@ -95,7 +96,7 @@ def exp(x):
     return y * float_of((half + one) << np.int32(23)) * float_of((rest + one) << np.int32(23))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def log(x):
     """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf.
 
@@ -114,3 +115,9 @@ def log(x):
     y = fma(f32(-0.5), s, y) + f
     y = fma(n, f32(0.693359375), y)
     return y if x < f32(math.inf) else x
+
+
+@kernel
+def sigmoid(x):
+    """The logistic function, to 2e-7."""
+    return f32(0.5) + f32(0.5) * tanh(f32(0.5) * x)

@@ -14,9 +14,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from mace_rl.agent.elementary import bits_of, float_of
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.products import LANES, VECTOR, everywhere, fused
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import bits_of, float_of
+from mace_rl.numerics.products import LANES, VECTOR, address, everywhere, fused
 
 VECTORS = 4
 BLOCK = VECTORS * LANES  # points whose distances are computed at once
@@ -52,7 +52,7 @@ class Neighbours:
 
 
 @kernel
-def room(count):
+def aligned_buffer(count):
     """So many floats at the beginning of a cache line: a vector that straddles two takes longer."""
     memory = np.empty(count + LANES, np.float32)
     first = -memory.ctypes.data % (4 * LANES) // 4
@@ -64,7 +64,7 @@ def in_blocks(points, mean, std):
     """`points` as `nearest_in_blocks` takes them: standardised, float32 [⌈M / 64⌉, size, 64]."""
     total, size = points.shape
     count = (total + BLOCK - 1) // BLOCK
-    blocks = room(count * size * BLOCK).reshape(count, size, BLOCK)
+    blocks = aligned_buffer(count * size * BLOCK).reshape(count, size, BLOCK)
     blocks[:] = np.float32(FAR)
     for i in range(size):
         scale = np.float32(1) / std[i]
@@ -188,7 +188,7 @@ def how_many(context: Any, bits: Any) -> Any:
 # then its place. So the nearest are the smallest, and of equally distant ones the first.
 PLACE = 2**32 - 1
 INFINITE = np.int32(0x7F800000)  # the bits of float32's Inf
-UNASKED = 4  # points of a block that are written down whether they are near or not
+ALWAYS_WRITTEN = 4  # points of a block that are written down whether they are near or not
 LARGEST = 2**63 - 1
 
 
@@ -202,8 +202,9 @@ def distance_in(number):
 def nearest_in_blocks(queries, blocks, mean, std, total, count):
     """See `Neighbours`; blocks: of `total` points, by `in_blocks`, for `mean` and `std`."""
     size, block_count = len(mean), len(blocks)
-    query, least = np.empty(size, np.float32), room(BLOCK)
-    distances = room((block_count + 1) * BLOCK)  # the last are never near
+    query, least = np.empty(size, np.float32), aligned_buffer(BLOCK)
+    distances = aligned_buffer((block_count + 1) * BLOCK)  # the last are never near
+    place = address(distances)
     numbers = np.empty(count + 2 * BLOCK + RANKED, np.int64)
     ranked = np.empty_like(numbers)
     squared_distances = np.empty((len(queries), count), np.float32)
@@ -211,23 +212,20 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
     for n in range(len(queries)):
         for i in range(size):
             query[i] = (queries[n, i] - mean[i]) * (np.float32(1) / std[i])
-        measure(
-            *(blocks.ctypes.data, block_count, query.ctypes.data, size),
-            *(distances.ctypes.data, least.ctypes.data),
-        )
-        bound, found = reach(least, count), 0
+        measure(address(blocks), block_count, address(query), size, place, address(least))
+        bound, found = distance_bound(least, count), 0
         for b in range(block_count):
-            bits = within(distances.ctypes.data + 4 * BLOCK * b, bound)
+            bits = within(place + 4 * BLOCK * b, bound)
             if b == block_count - 1:
                 bits &= ~np.uint64(0) >> np.uint64(block_count * BLOCK - total)
             # Most blocks have none to three, which no processor can foresee: to write down a few
             # too many, which the next block overwrites, takes less time than to ask.
             end = found + how_many(bits)
-            for k in range(UNASKED):
+            for k in range(ALWAYS_WRITTEN):
                 m = BLOCK * b + lowest(bits)
                 numbers[found + k] = np.int64(bits_of(distances[m])) << 32 | m
                 bits &= bits - np.uint64(1)
-            for k in range(found + UNASKED, end):
+            for k in range(found + ALWAYS_WRITTEN, end):
                 m = BLOCK * b + lowest(bits)
                 numbers[k] = np.int64(bits_of(distances[m])) << 32 | m
                 bits &= bits - np.uint64(1)
@@ -244,7 +242,7 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
 
 
 @kernel
-def reach(least, count):
+def distance_bound(least, count):
     """As far as at least `count` of 64 distances, in few steps: one that is hardly too large.
 
     It halves the bits of a float32, 2¹⁷ of which are a difference of 1.6 %. Inf if there are fewer.
@@ -254,7 +252,7 @@ def reach(least, count):
         return float_of(high)
     while high - low > 2**17:
         middle = np.int32((low + high) // 2)
-        if how_many(within(least.ctypes.data, float_of(middle))) < count:
+        if how_many(within(address(least), float_of(middle))) < count:
             low = middle
         else:
             high = middle
@@ -273,5 +271,5 @@ def sort(numbers, found, ranked):
     for k in range(found):
         rank = 0
         for first in range(0, found, RANKED):
-            rank += how_many(smaller(numbers.ctypes.data + 8 * first, numbers[k]))
+            rank += how_many(smaller(address(numbers) + 8 * first, numbers[k]))
         ranked[rank] = numbers[k]

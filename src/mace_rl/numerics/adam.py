@@ -5,19 +5,32 @@ than the rest of a small network's update.
 """
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-import torch
 
-from mace_rl.agent.kernels import kernel
-from mace_rl.agent.products import dot
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.products import dot
+from mace_rl.state import Stateful
 
 DECAY_MEAN, DECAY_SQUARE, EPSILON = 0.9, 0.999, 1e-5  # β₁, β₂ and ε
 
 
-class Adam:
+class AdamState(NamedTuple):
+    """What one step reads and, but for the rate and the norm, changes in place."""
+
+    parameters: np.ndarray  # float32 [n], like the next two
+    mean: np.ndarray  # running estimates of the gradient's moments
+    square: np.ndarray
+    decayed: np.ndarray  # float64 [2]: β₁ᵗ and β₂ᵗ after t steps
+    learning_rate: float
+    max_gradient_norm: float
+
+
+class Adam(Stateful):
     """Adam on one vector of parameters, changed in place, with the gradient clipped by its norm."""
+
+    STATE = ("parameters", "mean", "square", "decayed")
 
     def __init__(
         self,
@@ -33,13 +46,13 @@ class Adam:
 
     def step(self, gradient: np.ndarray) -> float:
         """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
-        return step(gradient, *self.state)
+        return step(gradient, self.state)
 
     @property
-    def state(self) -> tuple[Any, ...]:
+    def state(self) -> AdamState:
         """What the compiled `step` takes beside the gradient."""
-        rates = self.learning_rate, self.max_gradient_norm
-        return self.parameters, self.mean, self.square, self.decayed, *rates
+        moments = self.mean, self.square, self.decayed
+        return AdamState(self.parameters, *moments, self.learning_rate, self.max_gradient_norm)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """`direction`, [n], in the units in which this optimiser steps: over √v̂ + ε, float32 [n].
@@ -51,23 +64,11 @@ class Adam:
             return direction
         return preconditioned(direction, self.square, np.float32(1 - self.decayed[1]))
 
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters and the optimiser's moments."""
-        names = ("parameters", "mean", "square", "decayed")
-        return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, in place: the network holds the same arrays."""
-        for name, value in state.items():
-            getattr(self, name)[:] = value.numpy()
-
 
 @kernel
-def step(gradient, parameters, mean, square, decayed, learning_rate, max_gradient_norm):
-    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; see `Adam.step`.
-
-    gradient, parameters and the moments' running estimates, mean and square: float32 [n].
-    """
+def step(gradient, state):
+    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; see `Adam.step`."""
+    parameters, mean, square, decayed, learning_rate, max_gradient_norm = state
     norm = math.sqrt(dot(gradient, gradient))
     clipped = np.float32(max_gradient_norm / norm if norm > max_gradient_norm else 1)
     decayed[0] *= DECAY_MEAN

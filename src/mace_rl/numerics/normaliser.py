@@ -1,19 +1,21 @@
 """Running mean and standard deviation of observations."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from mace_rl.agent.kernels import kernel
+from mace_rl.numerics.compiling import kernel
+from mace_rl.state import Stateful
 
 
-class RunningNormaliser:
+class RunningNormaliser(Stateful):
     """Mean and standard deviation over everything seen so far (Chan et al. 1979), float64.
 
     Before the first `update` the mean is 0 and the standard deviation 1.
     """
+
+    STATE = ("count", "mean", "sum_of_squares")
 
     def __init__(self, size: int) -> None:
         self.count = 0
@@ -24,30 +26,30 @@ class RunningNormaliser:
 
     def update(self, observations: np.ndarray) -> None:
         """Take in `observations`, [N, size]."""
-        update(
-            *(observations, self.count, self.mean, self.sum_of_squares),
-            *(self.std, self.varied),
-        )
+        update(observations, self.count, self.mean, self.sum_of_squares, self.std, self.varied)
         self.count += len(observations)
 
     def __call__(self, observations: np.ndarray, bound: float = math.inf) -> np.ndarray:
         """(observations - mean) / std, clipped to ±bound; float32 [N, size]."""
         return standardised(observations, self.mean, self.std, bound)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs."""
-        return {
-            "count": self.count,
-            "mean": torch.from_numpy(self.mean.copy()),
-            "sum_of_squares": torch.from_numpy(self.sum_of_squares.copy()),
-        }
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self.count = state["count"]
-        self.mean[:] = state["mean"].numpy()
-        self.sum_of_squares[:] = state["sum_of_squares"].numpy()
+        """See `Stateful`."""
+        super().load_state_dict(state)
         spread(self.count, self.sum_of_squares, self.std, self.varied)
+
+
+class Normalisation(NamedTuple):
+    """How one observation is normalised, as it was at some time; float32 [observation] each."""
+
+    mean: np.ndarray
+    inverse_std: np.ndarray
+    clip: np.float32  # bound of normalised observations
+
+    @classmethod
+    def of(cls, mean: np.ndarray, std: np.ndarray, clip: float) -> "Normalisation":
+        """That of a running mean and standard deviation, [observation]."""
+        return cls(mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip))
 
 
 @kernel
@@ -86,4 +88,13 @@ def standardised(observations, mean, std, bound):
         for i in range(len(centre)):
             value = (observations[n, i] - centre[i]) * inverse[i]
             result[n, i] = min(max(value, -clip), clip)
+    return result
+
+
+@kernel
+def normalise(observation, normalisation, result):
+    """Fill in, and return, (observation - mean) / std, clipped to ±clip; float32 [size]."""
+    mean, inverse_std, clip = normalisation
+    for i in range(len(observation)):
+        result[i] = min(max((observation[i] - mean[i]) * inverse_std[i], -clip), clip)
     return result

@@ -14,7 +14,7 @@ with vectors of 16 floats: one register of AVX-512 or two of AVX2, as LLVM sees 
 loads a row of B once, whatever the number of rows of A.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -22,8 +22,8 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from mace_rl.agent.elementary import fma
-from mace_rl.compiling import njit
+from mace_rl.numerics.compiling import njit
+from mace_rl.numerics.elementary import fma
 
 LANES = 16  # columns of B and C come in multiples of this, filled up with zeros
 WIDE = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
@@ -46,17 +46,30 @@ def everywhere(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> i
     return builder.shuffle_vector(first, undefined, places)
 
 
+class Matrix(NamedTuple):
+    """A float32 matrix in memory: its address, and how many elements on the next ones begin."""
+
+    address: int
+    row: int
+    column: int  # 1 in B, C and what C starts from
+
+
 def tile(rows: int, vectors: int) -> Any:
     """The compiled tile of `rows` × 16 `vectors`: C = start + Σ_k A[i, k] B[k, j].
 
-    Its arguments are addresses (a, b, start, c) and distances: between rows of each and, for A,
-    between the elements of a row; all in bytes. The last one is K.
+    Its arguments are four `Matrix`, where in C it begins (row and column), and K.
     """
 
     @intrinsic
-    def multiply(context, a, a_row, a_k, b, b_row, start, start_row, c, c_row, count):
+    def multiply(context, a, b, start, c, first_row, first_column, count):
+        kinds = a, b, start, c
+
         def codegen(context, builder, signature, arguments):
-            a, a_row, a_k, b, b_row, start, start_row, c, c_row, count = arguments
+            *matrices, first_row, first_column, count = arguments
+
+            def bytes_of(matrix):
+                address, *distances = (builder.extract_value(matrix, part) for part in range(3))
+                return [address, *(builder.mul(distance, I64(4)) for distance in distances)]
 
             def place(base, row, distance, offset, kind):
                 address = builder.add(builder.add(base, builder.mul(row, distance)), offset)
@@ -65,6 +78,14 @@ def tile(rows: int, vectors: int) -> Any:
             def load(base, row, distance, offset, kind):
                 return builder.load(place(base, row, distance, offset, kind), align=4)
 
+            (a, a_row, a_k), *others = map(bytes_of, matrices)
+            a = builder.add(a, builder.mul(first_row, a_row))
+            right = builder.mul(first_column, I64(4))
+            (b, b_row), (start, start_row), (c, c_row) = (
+                (builder.add(address, right), row) for address, row, _ in others
+            )
+            start = builder.add(start, builder.mul(first_row, start_row))
+            c = builder.add(c, builder.mul(first_row, c_row))
             multiply_add = fused(builder.module)
             parts = [(i, v) for i in range(rows) for v in range(vectors)]
             begin = [load(start, I64(i), start_row, I64(4 * v * LANES), VECTOR) for i, v in parts]
@@ -97,7 +118,7 @@ def tile(rows: int, vectors: int) -> Any:
                 builder.store(value, place(c, I64(i), c_row, I64(4 * v * LANES), VECTOR), align=4)
             return context.get_dummy_value()
 
-        return types.void(*[types.intp] * 10), codegen
+        return types.void(*kinds, *[types.int64] * 3), codegen
 
     return multiply
 
@@ -118,47 +139,36 @@ def address(array):
 
 
 @njit(cache=True)
-def by_tiles(a, a_row, a_k, b, b_row, start, start_row, c, c_row, rows, columns, count):
-    """C = start + A · B for `rows` × `columns` elements and K = `count`; arguments as in `tile`."""
-    a_row, a_k, b_row, start_row, c_row = 4 * a_row, 4 * a_k, 4 * b_row, 4 * start_row, 4 * c_row
+def matrix(array):
+    """An array of two dimensions as a `Matrix`."""
+    return Matrix(address(array), array.strides[0] // 4, array.strides[1] // 4)
+
+
+@njit(cache=True)
+def by_tiles(a, b, start, c, rows, columns, count):
+    """C = start + A · B for `rows` × `columns` elements and K = `count`, of four `Matrix`."""
     j = 0
     while j < columns:
-        b_j, start_j, c_j = b + 4 * j, start + 4 * j, c + 4 * j
         i = 0
         if WIDE and rows == 1 and j + 16 * LANES <= columns:
-            long_row(a, a_row, a_k, b_j, b_row, start_j, start_row, c_j, c_row, count)
+            long_row(a, b, start, c, i, j, count)
             j += 16 * LANES
         elif j + 4 * LANES <= columns and (WIDE or rows == 1):
             while i + 4 <= rows:
-                broad(
-                    *(a + i * a_row, a_row, a_k, b_j, b_row),
-                    *(start_j + i * start_row, start_row, c_j + i * c_row, c_row, count),
-                )
+                broad(a, b, start, c, i, j, count)
                 i += 4
             while i + 2 <= rows:
-                broad_pair(
-                    *(a + i * a_row, a_row, a_k, b_j, b_row),
-                    *(start_j + i * start_row, start_row, c_j + i * c_row, c_row, count),
-                )
+                broad_pair(a, b, start, c, i, j, count)
                 i += 2
             if i < rows:
-                broad_row(
-                    *(a + i * a_row, a_row, a_k, b_j, b_row),
-                    *(start_j + i * start_row, start_row, c_j + i * c_row, c_row, count),
-                )
+                broad_row(a, b, start, c, i, j, count)
             j += 4 * LANES
         else:
             while i + SLIM_ROWS <= rows:
-                slim(
-                    *(a + i * a_row, a_row, a_k, b_j, b_row),
-                    *(start_j + i * start_row, start_row, c_j + i * c_row, c_row, count),
-                )
+                slim(a, b, start, c, i, j, count)
                 i += SLIM_ROWS
             while i < rows:
-                slim_row(
-                    *(a + i * a_row, a_row, a_k, b_j, b_row),
-                    *(start_j + i * start_row, start_row, c_j + i * c_row, c_row, count),
-                )
+                slim_row(a, b, start, c, i, j, count)
                 i += 1
             j += LANES
 
@@ -170,19 +180,14 @@ def product(a, b, start, c):
     a: [M, ≥ K] with any strides, so also a transposed matrix; b: [K, n], c: [M, n], their rows
     contiguous and n a multiple of 16; all float32.
     """
-    by_tiles(
-        *(address(a), a.strides[0] // 4, a.strides[1] // 4, address(b), b.shape[1]),
-        *(address(start), 0, address(c), c.shape[1], len(c), c.shape[1], len(b)),
-    )
+    row = Matrix(address(start), 0, 1)
+    by_tiles(matrix(a), matrix(b), row, matrix(c), len(c), c.shape[1], len(b))
 
 
 @njit(cache=True)
 def add_product(a, b, c):
     """C = C + A · B: every chain goes on from what C has; arguments as in `product`."""
-    by_tiles(
-        *(address(a), a.strides[0] // 4, a.strides[1] // 4, address(b), b.shape[1]),
-        *(address(c), c.shape[1], address(c), c.shape[1], len(c), c.shape[1], len(b)),
-    )
+    by_tiles(matrix(a), matrix(b), matrix(c), matrix(c), len(c), c.shape[1], len(b))
 
 
 @njit(cache=True)

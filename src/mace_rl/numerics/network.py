@@ -1,8 +1,8 @@
-"""Networks: one small interface, the vector-Jacobian product, and two implementations.
+"""Networks: one small interface, and two implementations.
 
 A `torch.nn.Module` defines each network. `TorchNetwork` runs any such module; `CompiledMLP` runs
 the default one, a tanh network, in compiled code. Whoever holds a network sees a flat vector of
-parameters, outputs, and gradients, and cannot tell which it is.
+parameters and outputs, and cannot tell which it is.
 """
 
 from itertools import pairwise
@@ -11,36 +11,17 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import torch
 
-from mace_rl.agent import kernels
-from mace_rl.agent.products import padded
-from mace_rl.config.agent import PPOConfig, TorchModule
-from mace_rl.config.plugins import make
-from mace_rl.config.section import ConfigError
-
-
-class Trace(NamedTuple):
-    """What a forward pass leaves for the backward pass."""
-
-    outputs: np.ndarray  # float32 [N, out]
-    saved: Any  # of the network's own
+from mace_rl.numerics import network_kernels as kernels
+from mace_rl.numerics.products import padded
 
 
 class Network(Protocol):
-    """A function of inputs and parameters with its vector-Jacobian product."""
+    """A function of inputs and parameters."""
 
     parameters: np.ndarray  # float32 [n]; whoever learns changes it in place
 
-    def forward(self, inputs: np.ndarray) -> Trace:
-        """Outputs for inputs, [N, in] → `Trace` with [N, out]."""
-
-    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """Gradient of a loss with respect to `parameters`, float32 [n].
-
-        trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
-        """
-
-    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same, and the gradient with respect to the inputs, [N, in]."""
+    def outputs(self, inputs: np.ndarray) -> np.ndarray:
+        """Float32 [N, out] for inputs, [N, in]."""
 
     def move_to(self, memory: np.ndarray) -> None:
         """Keep the parameters in `memory`, float32 [n], from now on."""
@@ -60,30 +41,10 @@ class TorchNetwork:
         vector = torch.nn.utils.parameters_to_vector(module.parameters())
         self.move_to(vector.detach().numpy().copy())
 
-    def forward(self, inputs: np.ndarray) -> Trace:
+    @torch.no_grad()
+    def outputs(self, inputs: np.ndarray) -> np.ndarray:
         """See `Network`."""
-        seen = torch.from_numpy(np.array(inputs, np.float32)).requires_grad_()
-        outputs = self._module(seen)
-        return Trace(outputs.detach().numpy(), (outputs, seen))
-
-    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
-        outputs, _ = trace.saved
-        gradients = torch.autograd.grad(
-            outputs,
-            list(self._module.parameters()),
-            torch.from_numpy(grad_outputs),
-            retain_graph=True,
-            materialize_grads=True,
-        )
-        return torch.cat([gradient.ravel() for gradient in gradients]).numpy()
-
-    def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Network`."""
-        outputs, seen = trace.saved
-        weights = torch.from_numpy(grad_outputs)
-        inward = torch.autograd.grad([outputs], [seen], [weights], retain_graph=True)
-        return self.backward(trace, grad_outputs), inward[0].numpy()
+        return self._module(torch.from_numpy(np.array(inputs, np.float32))).numpy()
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`."""
@@ -101,10 +62,17 @@ class TorchNetwork:
         self._module.load_state_dict(state)
 
 
+class Trace(NamedTuple):
+    """What a forward pass leaves for the backward pass."""
+
+    outputs: np.ndarray  # float32 [N, out]
+    saved: Any  # of the network's own
+
+
 class CompiledMLP:
     """The tanh network of `mlp` in compiled code.
 
-    `parameters` are laid out as in `kernels`, with zeros between them.
+    `parameters` are laid out as in `network_kernels`, with zeros between them.
     """
 
     def __init__(self, module: torch.nn.Sequential) -> None:
@@ -114,24 +82,29 @@ class CompiledMLP:
         self.parameters = np.zeros(count, np.float32)
         self.load_module_state(module.state_dict())
 
-    def forward(self, inputs: np.ndarray) -> Trace:
+    def outputs(self, inputs: np.ndarray) -> np.ndarray:
         """See `Network`."""
+        return self.forward(inputs).outputs
+
+    def forward(self, inputs: np.ndarray) -> Trace:
+        """Outputs for inputs, [N, in] → `Trace` with [N, out]."""
         inputs = np.ascontiguousarray(inputs, np.float32)
         outputs, activations = kernels.network_outputs(inputs, self.parameters, self.sizes)
         return Trace(outputs, (inputs, activations))
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
-        nobody_s = np.empty((0, 0), np.float32)
+        """Gradient of a loss with respect to `parameters`, float32 [n].
+
+        trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
+        """
         given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        return kernels.network_gradient(*given, nobody_s)
+        return kernels.network_gradient(*given)[0]
 
     def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Network`."""
-        inputs = self.sizes[0]
-        inward = np.empty((len(grad_outputs), padded(inputs)), np.float32)
+        """The same, and the gradient with respect to the inputs, [N, in]."""
         given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        return kernels.network_gradient(*given, inward), inward[:, :inputs]
+        gradient, first = kernels.network_gradient(*given)
+        return gradient, kernels.input_gradient(first, self.parameters, self.sizes)
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""
@@ -168,57 +141,6 @@ class CompiledMLP:
             biases[:] = state[f"{2 * place}.bias"].numpy()
 
 
-def network(
-    config: PPOConfig,
-    engine: str,
-    inputs: int,
-    outputs: int,
-    output_gain: float,
-    generator: np.random.Generator,
-) -> Network:
-    """A network as the settings ask for it, newly initialised; `output_gain`: see `mlp`."""
-    if isinstance(config.network, TorchModule):
-        module = custom_module(config.network, config.hidden_units, inputs, outputs, generator)
-        return TorchNetwork(module)
-    layers = mlp([inputs, *config.hidden_units, outputs], output_gain, generator)
-    return CompiledMLP(layers) if engine == "compiled" else TorchNetwork(layers)
-
-
-def custom_module(
-    settings: TorchModule,
-    hidden_units: list[int],
-    inputs: int,
-    outputs: int,
-    generator: np.random.Generator,
-) -> torch.nn.Module:
-    """The user's own module; what it draws from torch's global generator comes from `generator`.
-
-    Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
-    are not [N, outputs] or not the same twice: such a run would not resume to the bit.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(generator.integers(2**63)))
-        module = make(
-            settings.module,
-            "ppo.network.module",
-            torch.nn.Module,
-            True,
-            *(inputs, outputs, hidden_units),
-            **settings.arguments,
-        )
-        trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
-        shapes = [tuple(module(trial).shape), (2, outputs)]
-        same = torch.equal(module(trial), module(trial))
-    for problem, found in {
-        f"gives {shapes[0]} for inputs (2, {inputs}), not {shapes[1]}": shapes[0] != shapes[1],
-        "keeps state besides its parameters (buffers)": any(True for _ in module.buffers()),
-        "gives other outputs the second time (dropout?)": not same,
-    }.items():
-        if found:
-            raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
-    return module.float()
-
-
 def mlp(
     sizes: list[int], output_gain: float, generator: np.random.Generator
 ) -> torch.nn.Sequential:
@@ -240,7 +162,7 @@ def mlp(
 def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
     """The layers of `mlp`, with weights that mean nothing."""
     generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-    linear = [torch.nn.Linear(*pair) for pair in pairwise(sizes)]
+    linear = [torch.nn.Linear(*pair, device="cpu", dtype=torch.float32) for pair in pairwise(sizes)]
     torch.set_rng_state(generator)
     layers = [part for one in linear for part in (one, torch.nn.Tanh())]
     return torch.nn.Sequential(*layers[:-1])

@@ -1,0 +1,211 @@
+"""PPO's update in compiled code: K epochs over the minibatches in one call for each network.
+
+It computes what `TorchLearner` does, by gradients written out. That of a minibatch is a sum over
+its steps, in order. `products` continue a sum where it was left, so the steps go through the
+network in blocks that fit into the processor's nearest cache, with the bits that all at once would
+have.
+"""
+
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+
+from mace_rl.agent.distribution import log_prob_gradient, log_probs
+from mace_rl.agent.learner import Batch, Minibatches, Update, parameters_of
+from mace_rl.agent.policy import ActingPolicy, CompiledActing, Policy
+from mace_rl.config.agent import PPOConfig
+from mace_rl.numerics.adam import Adam, step
+from mace_rl.numerics.arrays import mean
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import exp, f32
+from mace_rl.numerics.network import CompiledMLP
+from mace_rl.numerics.network_kernels import activation_buffer, backward, forward, transposed
+from mace_rl.numerics.normaliser import Normalisation
+from mace_rl.numerics.products import padded
+from mace_rl.state import Stateful
+
+BLOCK = 64  # steps; 32 to 128 are as fast
+
+
+class CompiledLearner(Stateful):
+    """See `Learner`; for tanh networks."""
+
+    STATE = ("optimisers",)  # which have the parameters
+
+    def __init__(
+        self, config: PPOConfig, policy: Policy, critics: Mapping[str, CompiledMLP]
+    ) -> None:
+        """policy: of a `CompiledMLP`, too."""
+        self.config, self.policy, self.critics = config, policy, critics
+        self.network = cast(CompiledMLP, policy.network)
+        rates = dict.fromkeys(critics, config.critic_learning_rate)
+        rates["actor"] = config.actor_learning_rate
+        self.parameters = parameters_of(policy, critics)
+        self.optimisers = {
+            name: Adam(parameters, rates[name], config.max_gradient_norm)
+            for name, parameters in self.parameters.items()
+        }
+
+    def acting(self, normalisation: Normalisation) -> ActingPolicy:
+        """See `Learner`."""
+        return CompiledActing.of(self.network, self.policy.log_std, normalisation)
+
+    def update(
+        self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
+    ) -> Update:
+        """See `Learner`: each network goes through all epochs before the next one."""
+        adam = {name: optimiser.state for name, optimiser in self.optimisers.items()}
+        sizes, loss = self.network.sizes, (self.config.clip, self.config.entropy_coefficient)
+        norm, log_probs, entropies = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
+        norms, seen = {"actor": norm}, batch.observations
+        for kind, own in self.critics.items():
+            norms[kind] = improve_values(seen, returns[kind], minibatches, own.sizes, adam[kind])
+        acted = batch.log_probs[minibatches.epochs[-1]]
+        return Update(norms, *policy_change(log_probs, acted, self.config.clip), mean(entropies))
+
+    def policy_gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """See `Learner`."""
+        weights = np.stack([item / len(item) for item in advantages]).astype(np.float32)
+        observations = np.ascontiguousarray(observations, np.float32)
+        network, parameters = self.network, self.policy.parameters
+        return list(policy_gradients(observations, actions, weights, parameters, network.sizes))
+
+    def preconditioned(self, direction: np.ndarray) -> np.ndarray:
+        """See `Learner`."""
+        return self.optimisers["actor"].preconditioned(direction)
+
+
+@kernel
+def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
+    """Descend the clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
+
+    steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
+
+    Returns the last minibatch's gradient norm; and of the last epoch's steps, in its order, each as
+    its minibatch was learnt from, log π(a|s), float32 [N], and the policy's entropy, [N].
+    """
+    parameters, count = adam.parameters, len(steps.advantages)
+    log_std = own_part(parameters, sizes)
+    activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
+    gradient, norm = np.empty_like(parameters), 0.0
+    new_log_probs, entropies = np.empty(count, np.float32), np.empty(count)
+    for order in minibatches.epochs:
+        first = 0
+        for end in minibatches.ends:
+            back = transposed(parameters, sizes)
+            gradient[:] = 0
+            own, share = own_part(gradient, sizes), -1 / (end - first)
+            for start in range(first, end, BLOCK):
+                stop = min(start + BLOCK, end)
+                chosen, new = order[start:stop], new_log_probs[start:stop]
+                seen, done = taken(steps.observations, chosen), taken(steps.actions, chosen)
+                outputs = forward(seen, parameters, sizes, activations)[:, : sizes[-1]]
+                new[:] = log_probs(outputs, log_std, done)
+                weights = surrogate_weights(new, steps, chosen, clip, share)
+                grad, entropies[start:stop] = log_prob_gradient(
+                    outputs, log_std, done, weights, share * entropy_coefficient, own
+                )
+                backward(seen, activations, grad, back, sizes, gradient, scratch)
+            norm = step(gradient, adam)
+            first = end
+    return norm, new_log_probs, entropies
+
+
+@kernel
+def improve_values(observations, returns, minibatches, sizes, adam):
+    """Descend the mean squared error of V(s) against the λ-returns, float32 [N].
+
+    The other arguments as in `improve_policy`. Returns the last minibatch's gradient norm.
+    """
+    parameters = adam.parameters
+    activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
+    gradient, norm = np.empty_like(parameters), 0.0
+    for order in minibatches.epochs:
+        first = 0
+        for end in minibatches.ends:
+            back = transposed(parameters, sizes)
+            gradient[:] = 0
+            for start in range(first, end, BLOCK):
+                chosen = order[start : min(start + BLOCK, end)]
+                seen = taken(observations, chosen)
+                values = forward(seen, parameters, sizes, activations)
+                grad = np.zeros_like(values)
+                for n in range(len(chosen)):
+                    grad[n, 0] = f32(2 / (end - first)) * (values[n, 0] - returns[chosen[n]])
+                backward(seen, activations, grad, back, sizes, gradient, scratch)
+            norm = step(gradient, adam)
+            first = end
+    return norm
+
+
+@kernel
+def policy_gradients(observations, actions, weights, parameters, sizes):
+    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n].
+
+    parameters: a `Policy`'s; the other arguments as in `improve_policy`.
+    """
+    log_std, back = own_part(parameters, sizes), transposed(parameters, sizes)
+    activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
+    gradients = np.zeros((len(weights), len(parameters)), np.float32)
+    for start in range(0, len(observations), BLOCK):
+        end = min(start + BLOCK, len(observations))
+        seen, done = observations[start:end], actions[start:end]
+        outputs = forward(seen, parameters, sizes, activations)[:, : sizes[-1]]
+        for k in range(len(weights)):
+            own = own_part(gradients[k], sizes)
+            grad, _ = log_prob_gradient(outputs, log_std, done, weights[k, start:end], 0.0, own)
+            backward(seen, activations, grad, back, sizes, gradients[k], scratch)
+    return gradients
+
+
+@kernel
+def own_part(vector, sizes):
+    """What a vector like a `Policy`'s parameters has after its network's: of the log_std."""
+    count = 0
+    for layer in range(len(sizes) - 1):
+        count += (sizes[layer] + 1) * padded(sizes[layer + 1])
+    return vector[count:]
+
+
+@kernel
+def taken(array, chosen):
+    """The chosen rows, or elements, of an array, [N, …]."""
+    result = np.empty((len(chosen), *array.shape[1:]), array.dtype)
+    for n in range(len(chosen)):
+        result[n] = array[chosen[n]]
+    return result
+
+
+@kernel
+def surrogate_weights(new_log_probs, steps, chosen, clip, scale):
+    """What the gradient of PPO's clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
+
+    The surrogate min(rA, clip(r)A), with ratio r, is flat where the ratio is already past the bound
+    that the advantage pushes it to; elsewhere its gradient is r A ∇ log π, here times `scale`.
+    """
+    weights = np.empty_like(new_log_probs)
+    for n in range(len(weights)):
+        ratio = exp(new_log_probs[n] - steps.log_probs[chosen[n]])
+        advantage = steps.advantages[chosen[n]]
+        flat = ratio > 1 + clip if advantage > 0 else ratio < 1 - clip
+        weights[n] = f32(0) if flat else f32(scale) * ratio * advantage
+    return weights
+
+
+@kernel
+def policy_change(new_log_probs, old_log_probs, clip):
+    """How far the policy is from the one that acted, from log π(a|s) of both, float32 [N].
+
+    Returns the mean of r - 1 - log r, which estimates the KL divergence (Schulman 2020), and how
+    many of the ratios r are outside the clipping bounds, as a share.
+    """
+    divergence, outside = 0.0, 0.0
+    for n in range(len(new_log_probs)):
+        log_ratio = new_log_probs[n] - old_log_probs[n]
+        ratio = exp(log_ratio)
+        divergence += ratio - f32(1) - log_ratio
+        outside += abs(ratio - 1) > clip
+    return divergence / len(new_log_probs), outside / len(new_log_probs)

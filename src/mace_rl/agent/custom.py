@@ -1,0 +1,58 @@
+"""A network of the user's own."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from mace_rl.config.agent import TorchModule
+from mace_rl.config.plugins import make
+from mace_rl.config.section import ConfigError
+
+
+def custom_module(
+    settings: TorchModule,
+    hidden_units: list[int],
+    inputs: int,
+    outputs: int,
+    generator: np.random.Generator,
+) -> torch.nn.Module:
+    """The user's own module; what it draws from torch's global generator comes from `generator`.
+
+    Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
+    are not [N, outputs] or not the same twice: such a run would not resume to the bit.
+    """
+    with torch.random.fork_rng(devices=[]), as_torch_begins():
+        torch.manual_seed(int(generator.integers(2**63)))
+        module = make(
+            settings.module,
+            "ppo.network.module",
+            torch.nn.Module,
+            True,
+            *(inputs, outputs, hidden_units),
+            **settings.arguments,
+        )
+        trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
+        shapes = [tuple(module(trial).shape), (2, outputs)]
+        same = torch.equal(module(trial), module(trial))
+    for problem, found in {
+        f"gives {shapes[0]} for inputs (2, {inputs}), not {shapes[1]}": shapes[0] != shapes[1],
+        "keeps state besides its parameters (buffers)": any(True for _ in module.buffers()),
+        "gives other outputs the second time (dropout?)": not same,
+    }.items():
+        if found:
+            raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
+    return module.float()
+
+
+@contextmanager
+def as_torch_begins() -> Iterator[None]:
+    """New tensors are float32 on the CPU, whatever the program or the user's module has set."""
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)

@@ -1,0 +1,108 @@
+"""Distributions over actions: softmax for Discrete ones, else a diagonal Gaussian; compiled.
+
+Its log standard deviations, `log_std`, float32 [actions], do not depend on the state; for Discrete
+actions there are none.
+"""
+
+import numpy as np
+
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import HALF_LOG_TAU, exp, f32, log
+from mace_rl.numerics.products import padded
+
+
+@kernel
+def log_sum_exp(logits):
+    """log Σ exp of a vector, without overflow."""
+    largest = logits[0]
+    for logit in logits:
+        largest = max(largest, logit)
+    total = f32(0)
+    for logit in logits:
+        total += exp(logit - largest)
+    return largest + log(total)
+
+
+@kernel
+def log_probs(outputs, log_std, actions):
+    """log π(a|s), float32 [N].
+
+    outputs: the network's, [N, actions]: logits or means; actions: int64 [N] or float32 [N,
+    actions].
+    """
+    result = np.empty(len(outputs), np.float32)
+    if actions.ndim == 1:
+        for n in range(len(actions)):
+            result[n] = outputs[n, actions[n]] - log_sum_exp(outputs[n])
+    else:
+        for n in range(len(actions)):
+            total = f32(0)
+            for j in range(len(log_std)):
+                deviation = (actions[n, j] - outputs[n, j]) * exp(-log_std[j])
+                total -= f32(0.5) * deviation * deviation + log_std[j] + f32(HALF_LOG_TAU)
+            result[n] = total
+    return result
+
+
+@kernel
+def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_log_std):
+    """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at outputs and log_std.
+
+    weights: float32 [N]; outputs, log_std, actions: as in `log_probs`. Adds to grad_log_std, like
+    log_std. Returns the gradient at the outputs, [N, padded actions], and the entropies H, [N].
+    """
+    entropy_weight = f32(entropy_weight)
+    grad = np.zeros((len(outputs), padded(outputs.shape[1])), np.float32)
+    entropies = np.empty(len(outputs))
+    if actions.ndim == 1:
+        for n in range(len(actions)):
+            logits = outputs[n]
+            log_total, entropy = log_sum_exp(logits), f32(0)
+            for j in range(len(logits)):
+                log_prob = logits[j] - log_total
+                grad[n, j] = exp(log_prob)
+                entropy -= grad[n, j] * log_prob
+            entropies[n] = entropy
+            for j in range(len(logits)):
+                log_prob = logits[j] - log_total
+                grad[n, j] *= -(weights[n] + entropy_weight * (log_prob + entropy))
+            grad[n, actions[n]] += weights[n]
+    else:
+        entropies[:] = 0
+        for j in range(len(log_std)):
+            entropies += log_std[j] + f32(HALF_LOG_TAU + 0.5)
+            inverse_std = exp(-log_std[j])
+            for n in range(len(actions)):
+                deviation = (actions[n, j] - outputs[n, j]) * inverse_std
+                grad[n, j] = weights[n] * deviation * inverse_std
+                grad_log_std[j] += weights[n] * (deviation * deviation - f32(1)) + entropy_weight
+    return grad, entropies
+
+
+@kernel
+def sample_categorical(logits, uniform):
+    """Sample a categorical action by inverting its distribution function at `uniform` in [0, 1).
+
+    Returns (action from 0, log-probability, float32).
+    """
+    log_total = log_sum_exp(logits)
+    cumulative = 0.0
+    action = len(logits) - 1  # stays if rounding leaves the sum below `uniform`
+    for i in range(len(logits)):
+        cumulative += exp(logits[i] - log_total)
+        if uniform < cumulative:
+            action = i
+            break
+    return action, logits[action] - log_total
+
+
+@kernel
+def sample_gaussian(means, log_std, normal):
+    """Sample a diagonal Gaussian action, means + exp(log_std) · normal; `normal`: [actions].
+
+    Returns (action float32 [actions], not clipped to the bounds; log-probability, float32).
+    """
+    action = np.empty(len(log_std), np.float32)
+    for i in range(len(log_std)):
+        action[i] = means[i] + exp(log_std[i]) * f32(normal[i])
+    return action, log_probs(means.reshape(1, -1), log_std, action.reshape(1, -1))[0]

@@ -1,0 +1,78 @@
+"""What PPO's update needs of a learner, of which there are two: compiled, and in plain PyTorch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from mace_rl.agent.policy import ActingPolicy, Policy
+from mace_rl.numerics.network import Network
+from mace_rl.numerics.normaliser import Normalisation
+
+
+class Batch(NamedTuple):
+    """What the policy learns from: N steps of whole episodes, one after the other."""
+
+    observations: np.ndarray  # float32 [N, observation], normalised
+    actions: np.ndarray  # int64 [N] or float32 [N, actions]
+    log_probs: np.ndarray  # float32 [N], when the actions were taken
+    advantages: np.ndarray  # float32 [N], of the total reward, normalised
+
+
+class Minibatches(NamedTuple):
+    """Which steps of a batch each epoch learns from, and in which order."""
+
+    epochs: np.ndarray  # int64 [K, N], permutations of the steps
+    ends: np.ndarray  # int64 [M], where each minibatch of an epoch ends
+
+
+@dataclass
+class Update:
+    """What an update tells of itself."""
+
+    gradient_norms: dict[str, float]  # of the last minibatch, before clipping, by network
+    # Means over the steps of the last epoch, each as its minibatch was learnt from.
+    approximate_kl: float  # of the policy to the one that acted (Schulman 2020)
+    clip_fraction: float  # of the ratios outside the clipping bounds
+    entropy: float  # of the policy, nats
+
+
+class Learner(Protocol):
+    """Changes the parameters of the policy and the critics, which share none, in place."""
+
+    parameters: dict[str, np.ndarray]  # see `parameters_of`
+
+    def acting(self, normalisation: Normalisation) -> ActingPolicy:
+        """The policy for rollouts."""
+
+    def update(
+        self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
+    ) -> Update:
+        """Descend PPO's losses in every minibatch.
+
+        returns: for each critic the λ-returns that it learns, float32 [N].
+        """
+
+    def policy_gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
+
+    def preconditioned(self, direction: np.ndarray) -> np.ndarray:
+        """`direction` in the policy's parameters, [n], in the units in which its Adam steps.
+
+        That is over √v̂ + ε, v̂ the second moment; the direction itself before the first step.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """The optimiser's state; not the parameters."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+def parameters_of(policy: Policy, critics: Mapping[str, Network]) -> dict[str, np.ndarray]:
+    """Those of "actor" and of each critic, float32 [n]: the same memory."""
+    own = {kind: critic.parameters for kind, critic in critics.items()}
+    return {"actor": policy.parameters, **own}

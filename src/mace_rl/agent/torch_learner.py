@@ -1,0 +1,76 @@
+"""PPO in plain PyTorch: its losses (Schulman et al. 2017), autograd and `torch.optim.Adam`."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor, from_numpy
+from torch.nn.utils import clip_grad_norm_
+
+from mace_rl.agent.learner import Batch, Minibatches, Update, parameters_of
+from mace_rl.agent.policy import ActingPolicy, NetworkActing, Policy
+from mace_rl.agent.torch_policy import TorchPolicy
+from mace_rl.config.agent import PPOConfig
+from mace_rl.numerics.adam import EPSILON
+from mace_rl.numerics.network import Network
+from mace_rl.numerics.normaliser import Normalisation
+from mace_rl.state import Stateful
+
+
+class TorchLearner(Stateful):
+    """See `Learner`. It trains any torch module, and `CompiledLearner` computes what it does."""
+
+    STATE = ("parameters", "optimiser")
+
+    def __init__(self, config: PPOConfig, policy: Policy, critics: Mapping[str, Network]) -> None:
+        self.config, self.policy = config, policy
+        self.parameters = parameters_of(policy, critics)
+        self.actor = TorchPolicy(policy, validate=False)  # NaN is found in the gradients' norms
+        self.policy_gradients = self.actor.gradients
+        self.critics = {kind: critic.module() for kind, critic in critics.items()}
+        self.weights = {"actor": self.actor.weights()}
+        self.weights |= {kind: list(critic.parameters()) for kind, critic in self.critics.items()}
+        rates = dict.fromkeys(critics, config.critic_learning_rate)
+        rates["actor"] = config.actor_learning_rate
+        groups = [{"params": part, "lr": rates[name]} for name, part in self.weights.items()]
+        self.optimiser = torch.optim.Adam(groups, eps=EPSILON)
+
+    def losses(self, batch: Batch, returns: dict[str, np.ndarray]) -> tuple[Tensor, Tensor]:
+        """The loss of a minibatch, and [3]: approximate KL, clip fraction and entropy of it."""
+        observations, actions, log_probs, advantages = map(from_numpy, batch)
+        policy, epsilon = self.actor(observations), self.config.clip
+        log_ratio = policy.log_prob(actions) - log_probs
+        ratio = log_ratio.exp()
+        clipped = ratio.clip(1 - epsilon, 1 + epsilon)
+        surrogate = torch.min(ratio * advantages, clipped * advantages).mean()  # eq. 7
+        entropy = policy.entropy().mean()
+        loss = -surrogate - self.config.entropy_coefficient * entropy
+        for kind, critic in self.critics.items():
+            loss += (critic(observations)[:, 0] - from_numpy(returns[kind])).square().mean()
+        outside = ((ratio - 1).abs() > epsilon).float()
+        return loss, torch.stack([(ratio - 1 - log_ratio).mean(), outside.mean(), entropy]).detach()
+
+    def update(
+        self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
+    ) -> Update:
+        """See `Learner`. One loss will do: the networks share no weights."""
+        for order in minibatches.epochs:
+            told = np.zeros(3)
+            for chosen in np.split(order, minibatches.ends[:-1]):
+                targets = {kind: values[chosen] for kind, values in returns.items()}
+                loss, means = self.losses(Batch(*(part[chosen] for part in batch)), targets)
+                self.optimiser.zero_grad()
+                loss.backward()
+                most = self.config.max_gradient_norm
+                norms = {n: clip_grad_norm_(part, most).item() for n, part in self.weights.items()}
+                self.optimiser.step()
+                told += means.numpy() * len(chosen) / len(order)
+        return Update(norms, *told.tolist())
+
+    def acting(self, normalisation: Normalisation) -> ActingPolicy:
+        """See `Learner`."""
+        return NetworkActing(self.policy, normalisation)
+
+    def preconditioned(self, direction: np.ndarray) -> np.ndarray:
+        """See `Learner`."""
+        return self.actor.preconditioned(direction, self.optimiser)

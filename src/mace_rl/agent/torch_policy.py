@@ -1,0 +1,64 @@
+"""The policy as a torch module: observations → `torch.distributions.Distribution`."""
+
+import numpy as np
+import torch
+from torch import Tensor, from_numpy
+from torch.distributions import Categorical, Distribution, Independent, Normal
+
+from mace_rl.agent.policy import Policy
+from mace_rl.numerics.adam import DECAY_SQUARE, EPSILON
+
+
+class TorchPolicy(torch.nn.Module):
+    """π(·|s) for observations as the network sees them, [..., observation].
+
+    Discrete actions count from 0; the others are not clipped to their bounds. Its parameters are a
+    `Policy`'s: the same memory, but for those of a compiled network.
+    """
+
+    def __init__(self, policy: Policy, validate: bool | None = None) -> None:
+        """validate: whether distributions check their parameters; None: torch's default."""
+        super().__init__()
+        self.network, self.validate = policy.network.module(), validate
+        self.discrete = policy.discrete
+        if not self.discrete:
+            self.log_std = torch.nn.Parameter(from_numpy(policy.log_std))
+
+    def forward(self, observations: Tensor) -> Distribution:
+        """The distribution over actions in each state."""
+        outputs = self.network(observations)
+        if self.discrete:
+            return Categorical(logits=outputs, validate_args=self.validate)
+        normal = Normal(outputs, self.log_std.exp(), validate_args=self.validate)
+        return Independent(normal, 1, validate_args=self.validate)
+
+    def gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """See `Learner.policy_gradients`."""
+        log_probs = self(from_numpy(observations)).log_prob(from_numpy(actions))
+        found = []
+        for item in advantages:
+            mean = (log_probs * from_numpy(item.astype(np.float32))).mean()
+            parts = torch.autograd.grad(
+                mean, self.weights(), retain_graph=True, materialize_grads=True
+            )
+            found.append(torch.cat([part.ravel() for part in parts]).numpy())
+        return found
+
+    def weights(self) -> list[Tensor]:
+        """Its parameters, in the order of `Policy.parameters`."""
+        return [*self.network.parameters(), *([] if self.discrete else [self.log_std])]
+
+    def preconditioned(self, direction: np.ndarray, adam: torch.optim.Adam) -> np.ndarray:
+        """See `Learner.preconditioned`. A weight that has had no gradient has 0 in `direction`."""
+        states = [adam.state.get(part) or None for part in self.weights()]
+        if not any(states):
+            return direction
+        units = [
+            torch.ones_like(part)
+            if state is None
+            else (state["exp_avg_sq"] / (1 - DECAY_SQUARE ** state["step"])).sqrt() + EPSILON
+            for part, state in zip(self.weights(), states, strict=True)
+        ]
+        return direction / torch.cat([part.detach().ravel() for part in units]).numpy()

@@ -1,0 +1,104 @@
+"""What an environment draws from and remembers: saved for resuming, and checked by a replay."""
+
+import copy
+import hashlib
+import itertools
+import random
+from typing import Any
+
+import numpy as np
+import torch
+
+from mace_rl.environments.environment import Environment
+from mace_rl.environments.rollout import Episode, roll_out
+
+EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
+OFFERED = "load_state_dict"  # by an environment, beside `state_dict`
+
+
+def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
+    """All that can be known of what the next episode depends on: the environment's generator, what
+    its own `state_dict()` says if it has one, and the generators `of_process`, which takes longer.
+    """
+    inner: Any = environment.env.unwrapped
+    state = {
+        "np_random": _plain(environment.generator.bit_generator.state),
+        "own": copy.deepcopy(inner.state_dict()) if hasattr(inner, OFFERED) else None,
+    }
+    if of_process:
+        state["random"] = random.getstate()
+        state["numpy"] = _plain(np.random.get_state(legacy=False))  # noqa: NPY002
+        state["torch"] = torch.get_rng_state()
+    return state
+
+
+def set_state(environment: Environment, state: dict[str, Any]) -> None:
+    """Let environment and process go on from what `state_of` returned."""
+    inner: Any = environment.env.unwrapped
+    if state["own"] is not None:
+        inner.load_state_dict(copy.deepcopy(state["own"]))
+    environment.generator.bit_generator.state = state["np_random"]
+    if "random" in state:
+        random.setstate(state["random"])
+        np.random.set_state(state["numpy"])  # noqa: NPY002
+        torch.set_rng_state(state["torch"])
+
+
+class LastEpisodes:
+    """The last episodes: the state before each, its actions, and what came of them.
+
+    They are in two blocks. The generators of the process are saved before the first of a block.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: list[list[dict[str, Any]]] = [[]]
+        self.start: dict[str, Any] = {}
+
+    def begin(self, environment: Environment) -> None:
+        """An episode is to be played."""
+        block = self.blocks[-1]
+        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+            self.blocks = [block, []]
+        self.start = state_of(environment, of_process=not self.blocks[-1])
+
+    def end(self, episode: Episode) -> None:
+        """It has been played."""
+        actions = torch.from_numpy(episode.actions)
+        one = {"start": self.start, "actions": actions, "outcome": _digest(episode)}
+        self.blocks[-1].append(one)
+
+
+def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
+    """How a fresh environment, given their actions again, plays episodes otherwise; "" if not.
+
+    blocks: of `LastEpisodes`. What it kept from them for later it then has kept again.
+    """
+    for one in itertools.chain.from_iterable(blocks):
+        set_state(environment, one["start"])
+        try:
+            episode = roll_out(environment, _Again(), one["actions"].numpy())
+        except Exception as error:  # noqa: BLE001  (whatever it raises, in a state it never had)
+            return " ".join(f"{type(error).__name__}: {error}".split())
+        if _digest(episode) != one["outcome"]:
+            return "other observations or rewards"
+    return ""
+
+
+class _Again:
+    """A policy whose noise are the actions to take."""
+
+    def act(self, observation: np.ndarray, noise: Any) -> tuple[Any, np.float32]:
+        return (noise if isinstance(noise, np.ndarray) else int(noise)), np.float32(0)
+
+
+def _digest(episode: Episode) -> str:
+    parts = (episode.observations, episode.rewards, np.array(float(episode.terminated)))
+    # + 0: compiled code may have -0.0 where the environment has 0.0, which is no difference.
+    return hashlib.sha256(b"".join((part + 0).tobytes() for part in parts)).hexdigest()
+
+
+def _plain(state: Any) -> Any:
+    """A NumPy generator's state with lists for its arrays."""
+    if isinstance(state, dict):
+        return {key: _plain(value) for key, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray) else state

@@ -1,0 +1,66 @@
+"""numba's `njit`, with a cache on disk that notices every edit of this package.
+
+numba's own does not notice an edit in another file than the cached function's. So each state of
+this package gets a folder to itself, set while a function of ours is decorated and not longer: what
+else is compiled in this process, a program of somebody's, has its cache where it had it.
+"""
+
+import logging
+import os
+import stat
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from mace_rl.refusal import Refusal
+from mace_rl.sources import PACKAGE, digest
+
+config: Any = numba.config  # which it fills as it is imported
+if config.DISABLE_JIT:
+    raise Refusal("NUMBA_DISABLE_JIT is set, but this code runs compiled only: unset it")
+# Where this cannot be written, numba takes the user's folder for caches.
+# Not config.CACHE_DIR, which a .numba_config.yaml in the current folder sets: what is there is run.
+FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__" / "numba")
+FOLDER /= digest("everything")[:16]
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """The decorator `numba.njit(**options)`."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(FOLDER)
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError as error:
+            if "no locator available" not in str(error):
+                raise
+            config.CACHE_DIR = spare_folder()
+            return numba.njit(**options)(function)
+        finally:
+            config.CACHE_DIR = before
+
+    return compiled
+
+
+@cache  # says it once
+def spare_folder() -> str:
+    """Where neither `FOLDER` nor the user's own can be written: one that others cannot write.
+
+    numba runs what it finds there.
+    """
+    folder = Path(tempfile.gettempdir(), f"mace-rl-numba-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if (found.st_mode, found.st_uid) != (stat.S_IFDIR | 0o700, os.getuid()):
+        raise Refusal(f"{folder} is not this user's alone: let NUMBA_CACHE_DIR name a folder")
+    said = "compiled code is kept in %s, since %s cannot be written; NUMBA_CACHE_DIR names another"
+    logging.getLogger(__name__).warning(said, folder, FOLDER.parent)
+    return str(folder / FOLDER.name)
+
+
+# Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
+kernel = njit(cache=True, error_model="numpy")

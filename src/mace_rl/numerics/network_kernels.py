@@ -1,0 +1,159 @@
+"""The compiled functions of a tanh network: outputs, and gradients by backpropagation (numba).
+
+Networks of 64 units are too small for a tensor library, whose calls cost more than the work in
+them. All arithmetic is float32, in an order that is written here or in `products` and `elementary`,
+so the bits are the same on every processor, for one state as for many, step by step as in one loop.
+
+A network is a flat vector of parameters and its sizes, int64 [layers + 1]. A layer's parameters are
+its weights and, as the last row, its biases, [in + 1, padded out]: products want their columns in
+multiples of 16, so columns of zeros are added. Their gradient is 0, so they stay zeros.
+"""
+
+import math
+
+import numpy as np
+
+from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.elementary import f32, tanh
+from mace_rl.numerics.products import Matrix, add_product, address, by_tiles, dot, padded, product
+
+
+@kernel
+def activation_buffer(count, sizes):
+    """A buffer for what every layer puts out for `count` inputs, flat: [count, padded out] each."""
+    width = 0
+    for outs in sizes[1:]:
+        width += padded(outs)
+    return np.empty(count * width, np.float32)
+
+
+@kernel
+def forward(inputs, parameters, sizes, activations):
+    """A tanh network's outputs for N inputs, a view of `activations`, [N, padded out].
+
+    inputs: [N, in]; activations: from `activation_buffer` for at least N, filled in.
+    """
+    below, weights, end = Matrix(address(inputs), inputs.shape[1], 1), address(parameters), 0
+    for layer in range(len(sizes) - 1):
+        ins, width = sizes[layer], padded(sizes[layer + 1])
+        bias = weights + 4 * ins * width
+        above = activations[end : end + len(inputs) * width]
+        outputs, matrix = Matrix(address(above), width, 1), Matrix(weights, width, 1)
+        by_tiles(below, matrix, Matrix(bias, 0, 1), outputs, len(inputs), width, ins)
+        if layer < len(sizes) - 2:
+            for k in range(len(above)):
+                above[k] = tanh(above[k])
+        below, weights, end = outputs, bias + 4 * width, end + len(above)
+    return above.reshape(len(inputs), width)
+
+
+@kernel
+def transposed(parameters, sizes):
+    """The weights of each layer, transposed for `backward`, [out, padded in]."""
+    total = 0
+    for layer in range(len(sizes) - 1):
+        total += sizes[layer + 1] * padded(sizes[layer])
+    result = np.zeros(total, np.float32)
+    start = place = 0
+    for layer in range(len(sizes) - 1):
+        ins, outs = sizes[layer], sizes[layer + 1]
+        end = start + (ins + 1) * padded(outs)
+        weights = parameters[start:end].reshape(ins + 1, padded(outs))
+        for j in range(outs):
+            row = result[place : place + ins]
+            for i in range(ins):
+                row[i] = weights[i, j]
+            place += padded(ins)
+        start = end
+    return result
+
+
+@kernel
+def backward(inputs, activations, grad_outputs, back, sizes, gradient, grad_activations):
+    """Add to `gradient`, like the parameters, that of a loss; returns it at the first layer's sums.
+
+    inputs, activations: of `forward`; grad_outputs: the loss's gradient at the outputs, [N, padded
+    out], with zeros in the columns added; back: the weights `transposed`; grad_activations: like
+    `activations`, overwritten.
+    """
+    count, ones = len(inputs), np.ones((1, len(inputs)), np.float32)
+    end = place = below_end = 0
+    for layer in range(len(sizes) - 1):
+        end += (sizes[layer] + 1) * padded(sizes[layer + 1])
+        place += sizes[layer + 1] * padded(sizes[layer])
+        if layer > 0:
+            below_end += count * padded(sizes[layer])
+    grad = grad_outputs
+    for layer in range(len(sizes) - 2, -1, -1):
+        ins, outs = sizes[layer], sizes[layer + 1]
+        start = end - (ins + 1) * padded(outs)
+        change = gradient[start:end].reshape(ins + 1, padded(outs))
+        end = start
+        add_product(ones, grad, change[ins:])
+        if layer == 0:
+            add_product(inputs.T, grad, change[:ins])
+            break
+        width = padded(ins)
+        weights = back[place - outs * width : place].reshape(outs, width)
+        place -= outs * width
+        below_start = below_end - count * width
+        below = activations[below_start:below_end]
+        flat = grad_activations[below_start:below_end]
+        below_end = below_start
+        add_product(below.reshape(count, width).T, grad, change[:ins])
+        grad_below = flat.reshape(count, width)
+        product(grad, weights, np.zeros(width, np.float32), grad_below)
+        for k in range(len(flat)):
+            flat[k] *= f32(1) - below[k] * below[k]  # tanh'
+        grad = grad_below
+    return grad
+
+
+@kernel
+def network_outputs(inputs, parameters, sizes):
+    """A tanh network's outputs for N inputs, [N, out], and its activations."""
+    activations = activation_buffer(len(inputs), sizes)
+    outputs = forward(inputs, parameters, sizes, activations)
+    return outputs[:, : sizes[-1]].copy(), activations
+
+
+@kernel
+def network_gradient(inputs, activations, parameters, grad_outputs, sizes):
+    """Gradient, like the parameters, of a loss, and that at the first layer's sums.
+
+    activations: of `network_outputs`; grad_outputs: the loss's gradient at the outputs, [N, out].
+    """
+    padded_grad = np.zeros((len(inputs), padded(sizes[-1])), np.float32)
+    padded_grad[:, : sizes[-1]] = grad_outputs
+    gradient, scratch = np.zeros_like(parameters), np.empty_like(activations)
+    back = transposed(parameters, sizes)
+    return gradient, backward(inputs, activations, padded_grad, back, sizes, gradient, scratch)
+
+
+@kernel
+def input_gradient(grad_first, parameters, sizes):
+    """A loss's gradient at the inputs, [N, in], from that at the first layer's sums."""
+    outs, width = sizes[1], padded(sizes[0])
+    weights = transposed(parameters, sizes)[: outs * width].reshape(outs, width)
+    result = np.empty((len(grad_first), width), np.float32)
+    product(grad_first, weights, np.zeros(width, np.float32), result)
+    return result[:, : sizes[0]]
+
+
+@kernel
+def orthonormal(matrix):
+    """Orthonormal columns that span what the columns of `matrix` do, float64 [M, N], M ≥ N.
+
+    Gram and Schmidt's, each column twice for the sake of rounding. Of a Gaussian matrix it is
+    uniform over all that are possible.
+    """
+    result = matrix.copy()
+    for j in range(result.shape[1]):
+        column = result[:, j].copy()
+        for before in range(2 * j):
+            other = result[:, before % j].copy()
+            along = dot(other, column)
+            for i in range(len(column)):
+                column[i] -= along * other[i]
+        result[:, j] = column / math.sqrt(dot(column, column))
+    return result

@@ -1,0 +1,67 @@
+"""What a checkpoint holds of an object: the attributes that it names."""
+
+import copy
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+
+
+class Stateful:
+    """`STATE` names the attributes that the rest of a run depends on.
+
+    Arrays, numbers, None, NumPy's generators, what has a `state_dict` of its own; and lists, deques
+    and dictionaries of these.
+    """
+
+    STATE: tuple[str, ...] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
+        return {name: saved(getattr(self, name)) for name in self.STATE}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned; arrays of the same shape in place."""
+        for name in self.STATE:
+            setattr(self, name, restored(getattr(self, name), state[name]))
+
+
+def saved(value: Any) -> Any:
+    """A copy of `value` for a checkpoint."""
+    match value:
+        case np.ndarray():
+            return torch.from_numpy(value.copy())
+        case np.random.Generator():
+            return value.bit_generator.state
+        case Stateful():
+            return value.state_dict()
+        case dict():
+            return {name: saved(item) for name, item in value.items()}
+        case list() | tuple() | deque():
+            return [saved(item) for item in value]
+    return copy.deepcopy(value.state_dict()) if hasattr(value, "state_dict") else value
+
+
+def restored(current: Any, state: Any) -> Any:
+    """What `saved` made `state` of, to take the place of `current`, which may be it, changed."""
+    if isinstance(current, np.random.Generator):
+        current.bit_generator.state = state
+        return current
+    if hasattr(current, "load_state_dict"):
+        current.load_state_dict(state)
+        return current
+    match state:
+        case torch.Tensor():
+            if not isinstance(current, np.ndarray) or current.shape != state.shape:
+                return state.numpy().copy()
+            current[...] = state.numpy()
+            return current
+        case dict():
+            before = current or {}
+            items = {name: restored(before.get(name), item) for name, item in state.items()}
+            return items if current is None else type(current)(items)
+        case list():
+            several = [restored(None, item) for item in state]
+            return deque(several, current.maxlen) if isinstance(current, deque) else several
+    return state
