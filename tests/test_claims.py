@@ -1,28 +1,34 @@
 """The verdicts of the protocol's rule, from tables in which the truth is known."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
 from invented import (
+    CLAIMS,
     EPISODES,
     LITERAL,
     PAPERS,
     QUESTIONS,
     ROBUST,
     ROOT,
+    STUDY,
     table_for_claims,
     table_for_questions,
 )
 
+from mace_rl.config.section import ConfigError
 from mace_rl.runs.records import RecordError
-from mace_rl.study.claims_config import CORRELATION
+from mace_rl.study.claims_config import parts_of, read_claims
 from mace_rl.study.compare import verdicts
-from mace_rl.study.compare.ledger import Finding
+from mace_rl.study.compare.ledger import Finding, read_ledger, to_json
 from mace_rl.study.config import Study, read_study
+from mace_rl.study.measure.metrics import CORRELATION
 
+QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
 PLAIN = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
@@ -34,7 +40,7 @@ BUT_C6 = [f"C{number}" for number in range(1, 11) if number != 6]  # which says 
 OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
 
 
-def parts_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
+def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
     answers = verdicts.ledger(frame, study.metrics, PAPERS)
     (answer,) = (one for one in answers if one.claim == claim)
     return answer.ways[ROBUST].parts
@@ -133,7 +139,7 @@ def test_all_parts_are_corrected_together_and_have_the_margin_of_what_they_measu
 
 def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    part = parts_of(frame, study, "C1")[0]
+    part = found_of(frame, study, "C1")[0]
     assert (part.variant, part.baseline) == ("mace_full", "ppo")
     runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])
     times = runs["sample_efficiency_common"]
@@ -160,7 +166,7 @@ def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
 
 def test_one_seed_has_estimates_but_no_tests(study: Study) -> None:
     frame = table_for_claims(1, PLAIN, noise=0.02)
-    part = parts_of(frame, study, "C1")[0]
+    part = found_of(frame, study, "C1")[0]
     runs = frame[frame["env"] == "Acrobot-v1"].set_index("variant")["sample_efficiency_common"]
     assert part.difference == runs["ppo"] - runs["mace_full"]
     untold = "low", "high", "p_value", "p_holm", "detectable"
@@ -171,7 +177,7 @@ def test_a_part_without_a_test_counts_where_all_are_corrected(study: Study) -> N
     frame = table_for_claims(12, PLAIN, noise=0.02)
     one_seed = frame[(frame["env"] != "HopperBulletEnv-v0") | (frame["seed"] == 0)]
     # By 2 of 2¹² sign patterns, as in most others; of 24 only C8's two parts have smaller p values.
-    found = [part.p_holm for part in parts_of(one_seed, study, "C1")]
+    found = [part.p_holm for part in found_of(one_seed, study, "C1")]
     assert found == pytest.approx([22 * 2 / 2**12] * 2)
 
 
@@ -181,15 +187,14 @@ def test_variants_of_different_budgets_are_compared_within_the_shorter(study: St
     for variant, budget in (("ppo", 4000), ("mace_full", 2000), ("mace_fixed", 500)):
         own = (frame["env"] == "CartPole-v1") & (frame["variant"] == variant)
         frame.loc[own, ["episodes", "sample_efficiency_common"]] = budget  # never reached
-    over_ppo, over_fixed = parts_of(frame, study, "C5")
+    over_ppo, over_fixed = found_of(frame, study, "C5")
     assert (over_ppo.difference, over_ppo.probability) == (0, 0.5)
     assert (over_ppo.worth_mentioning, over_fixed.worth_mentioning) == (100, 25)
 
 
 def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds() -> None:
     """Q7: three tasks, of which one has more seeds."""
-    settings = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
-    settings = settings.model_copy(update={"bootstrap_repetitions": 1000})
+    settings = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})
     frame = table_for_questions(30, mace_full=0.3)
     frame = frame[(frame["env"] == "BarrenRegion-v0") | (frame["seed"] < 12)]
     found = verdicts.ledger(frame, settings, QUESTIONS)
@@ -204,3 +209,59 @@ def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds
     assert (part.worth_mentioning, part.seeds) == (0.05, 12)
     assert [len(answer.ways[ROBUST].parts) for answer in found] == [5, 3, 5, 5, 5, 4, 1, 1]
     assert all(list(answer.ways) == [ROBUST] for answer in found)
+
+
+def test_the_ledger_is_read_as_it_was_written(tmp_path: Path) -> None:
+    answers = verdicts.ledger(table_for_claims(1, PLAIN, 0.1), STUDY.metrics, PAPERS)  # with NaN
+    path = tmp_path / "claims.json"
+    path.write_text(to_json({"runs": 9}, answers), encoding="utf-8")
+    assert repr(read_ledger(path)) == repr(answers)
+
+
+# The file of what a paper says.
+
+MISTAKES = [  # one text for another, and what is said of it
+    ("variant: mace_full", "variant: mace_ful", ["C1.parts", "'mace_ful'", "'mace_full'"]),
+    ("metric: final_return", "metric: final_retrun", ["C6.parts", "'final_retrun'", "'final_re"]),
+    ("[Acrobot-v1, HopperB", "[Acrobat-v1, HopperB", ["C7.parts", "'Acrobat-v1'", "'Acrobot-v1'"]),
+    (
+        "- &full {",
+        "- &full {tugether: true, ",
+        ['tugether" (value True)', "C1.parts", "'together'"],
+    ),
+    ("over: [ppo, mace_fixed]", "over: [mace_full]", ["C1.parts", "the variant itself"]),
+    ("robust: *above", "rubust: *above", ["C7.parts", "'rubust'", "'robust'"]),
+    ("          robust: *above\n", "", ["C7.parts", "'robust'] as the first"]),
+    ("    C2:", "    Q1:", ["questions.claims.Q1", "twice"]),
+    ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
+    ("table1: {environment: Acro", "table1: {environment: Kart", ["C1.table1", "'Kartbot-v1'"]),
+    ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
+    ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
+    ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "said"), MISTAKES)
+def test_a_mistake_in_the_file_of_claims_is_named(tmp_path: Path, old, new, said) -> None:
+    text = (ROOT / STUDY.claims).read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "claims.yaml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigError) as refusal:
+        read_claims(STUDY, path)
+    message = str(refusal.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    assert all(words in message for words in said), message
+
+
+def test_what_a_study_lacks_for_a_family() -> None:
+    for title, family in CLAIMS.families.items():
+        parts = [part for _, part in parts_of(family)]
+        names = {name for part in parts for name in (*part.environments, part.variant, *part.over)}
+        settings = QUESTIONED
+        assert CLAIMS.lacking(names, names, settings)[title] == []
+        for name in names:
+            assert CLAIMS.lacking(names - {name}, names - {name}, settings)[title] == [name]
+        bare = settings.model_copy(update={"reference_return": {}})
+        (first, *_) = CLAIMS.lacking(names, names, bare)[title]
+        assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))

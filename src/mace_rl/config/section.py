@@ -148,8 +148,8 @@ def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The settings classes in a type: itself, or the members of a union."""
-    if get_origin(annotation) in (Union, types.UnionType, Annotated):
+    """The settings classes in a type: itself, or those of a union's members or a list's values."""
+    if get_origin(annotation) in (Union, types.UnionType, Annotated, dict, list):
         return [one for argument in get_args(annotation) for one in _sections(argument)]
     is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
     return [annotation] if is_section else []
