@@ -77,8 +77,7 @@ def table2():
     """Table 2: the hyperparameters."""
     from mace_rl.study.show.latex import table2_latex
 
-    papers = parse_claims(found.claims).table2
-    write_atomically(output[0], table2_latex(ppo(), papers))
+    write_atomically(output[0], table2_latex(ppo(), parse_claims(found.claims).table2))
 
 
 def ppo():

@@ -62,6 +62,13 @@ class Table1Config(Section):
         return set(self.values) <= set(environments) and set(self.variants) <= set(variants)
 
 
+class Table2Config(Section):
+    """The paper's Table 2; both by the settings of `ppo`."""
+
+    rows: dict[str, str] = Field(default={})  # what they are called there
+    others: dict[str, str] = Field(default={})  # what the paper leaves open
+
+
 class PlaceConfig(Section):
     """A column of the paper's Table 1."""
 
@@ -146,7 +153,7 @@ class ClaimsConfig(Section):
     report: ReportConfig
     variants: dict[str, str] = Field(default={})  # what they are called in few words
     table1: Table1Config
-    table2: dict[str, str] = Field(default={})  # settings of `ppo`, and what the paper calls them
+    table2: Table2Config = Field(default=Table2Config())
     ways: dict[str, str]  # to measure a claim, each with what the report says of it
     families: dict[str, FamilyConfig] = Field(default={})
 
@@ -225,7 +232,7 @@ def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
     yield "table1.shuffled", "measured", table1.shuffled
     yield "table1.variants", "variant", table1.variants
     yield "table1.values", "environment", table1.values
-    yield "table2", "setting", claims.table2
+    yield "table2", "setting", [*claims.table2.rows, *claims.table2.others]
     yield "report.tasks", "environment", claims.report.tasks
     for title, family in claims.families.items():
         for name, claim in family.claims.items():

@@ -243,44 +243,23 @@ def solved(curve: LearningCurve) -> float:
     return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
 
 
-METRICS = (
+def _episodes(function: Callable[[LearningCurve], Attained], label: str, *needs: str) -> Metric:
+    return Metric(function.__name__, label, "episodes", function, *needs)
+
+
+METRICS = (  # the area is under the learning curve, per episode
     Metric("final_return", "Final return", "return", lambda curve: curve.final),
-    Metric("sample_efficiency", "Sample efficiency", "episodes", sample_efficiency),
-    Metric("convergence_steps", "Convergence", "episodes", convergence_steps),
-    Metric(  # under the learning curve, per episode
-        "area_under_curve", "Mean return of training", "return", lambda curve: curve.returns.mean()
-    ),
+    _episodes(sample_efficiency, "Sample efficiency"),
+    _episodes(convergence_steps, "Convergence"),
+    Metric("area_under_curve", "Mean return of training", "return", lambda c: c.returns.mean()),
     Metric("early_return", "Mean return of the beginning", "return", early_return),
     Metric("solved", "Solved at the end", "share", solved, "solved_return"),
-    Metric(
-        "sample_efficiency_common",
-        "Sample efficiency (common bar)",
-        "episodes",
-        sample_efficiency_common,
-        "reference_return",
-    ),
-    Metric(
-        "sample_efficiency_range", "Sample efficiency (range)", "episodes", sample_efficiency_range
-    ),
-    Metric("convergence_steps_range", "Convergence (range)", "episodes", convergence_steps_range),
-    Metric(
-        "convergence_steps_steepest",
-        "Convergence (steepest)",
-        "episodes",
-        convergence_steps_steepest,
-    ),
-    Metric(
-        "convergence_steps_flattest",
-        "Convergence (flattest)",
-        "episodes",
-        convergence_steps_flattest,
-    ),
-    Metric(
-        "convergence_steps_public_code",
-        "Convergence (public code)",
-        "episodes",
-        convergence_steps_public_code,
-    ),
+    _episodes(sample_efficiency_common, "Sample efficiency (common bar)", "reference_return"),
+    _episodes(sample_efficiency_range, "Sample efficiency (range)"),
+    _episodes(convergence_steps_range, "Convergence (range)"),
+    _episodes(convergence_steps_steepest, "Convergence (steepest)"),
+    _episodes(convergence_steps_flattest, "Convergence (flattest)"),
+    _episodes(convergence_steps_public_code, "Convergence (public code)"),
 )
 
 

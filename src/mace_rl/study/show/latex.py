@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.study.claims_config import Table1Config
+from mace_rl.study.claims_config import Table1Config, Table2Config
 from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
 from mace_rl.study.compare.summary import from_to
 from mace_rl.study.metrics_config import MetricsConfig
@@ -43,13 +43,13 @@ def table1_latex(
     return latex_float(what + _how(table, settings.confidence), "tab:table1", frame)
 
 
-def table2_latex(ppo: Mapping[str, PPOConfig], papers: Mapping[str, str]) -> str:
+def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
     """Table 2, the PPO hyperparameters: the paper's rows, a line, and this project's."""
     rows = [
         f"\\raggedright {escaped(name)} & {latex_cell(value)} \\\\"
-        for name, value in tables.table2(ppo, papers).to_numpy()
+        for name, value in tables.table2(ppo, paper).to_numpy()
     ]
-    end = len(papers) + 1  # and Adam
+    end = len(paper.rows) + 1  # and Adam
     lines = [
         r"\begin{table}[tbp]",
         r"\centering",

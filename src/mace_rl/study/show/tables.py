@@ -13,7 +13,7 @@ import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.runs.progress import duration
-from mace_rl.study.claims_config import Table1Config
+from mace_rl.study.claims_config import Table1Config, Table2Config
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
@@ -25,22 +25,6 @@ from mace_rl.study.show.cells import Cell, Value, estimate, number
 CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
-
-OWN_SETTINGS = {  # what the paper leaves open; a setting that is not here is named after its key
-    "gae_lambda": "GAE Parameter (λ)",
-    "rollout_steps": "Steps per Update, at least (whole episodes)",
-    "minibatch_size": "Minibatch Size (steps)",
-    "network": "Network of Actor and of Critic",
-    "hidden_units": "Hidden Units of Actor and of Critic",
-    "initial_log_std": "Initial Log Standard Deviation (continuous actions)",
-    "max_gradient_norm": "Maximal Gradient Norm",
-    "normalise_observations": "Normalised Observations",
-    "entropy_coefficient": "Entropy Coefficient",
-    "scale_rewards": "Rewards over the Deviation of their Discounted Sums",
-    "scale_advantages": "Advantages over their Root Mean Square, by Kind of Reward",
-    "smallest_advantage": "Smallest Scale of Extrinsic Advantages",
-    "centre_advantages": "Centred Advantages",
-}
 
 
 def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
@@ -228,30 +212,26 @@ def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
 def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.DataFrame:
     """Every part of the claims, measured in one of the ways, with these `names`, if any."""
     rows = []
-    for answer in answers:
-        for part in answer.ways[how].parts:
-            # Of a return as many as the margin needs, which depends on the environment's scale.
-            of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
-            digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
-            pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
-            margins = (part.in_paper, part.worth_mentioning, part.detectable)
-            rows.append(
-                [
-                    answer.claim,
-                    "all" if len(part.environments) > 1 else part.environments[0],
-                    names.get(part.metric, part.metric),
-                    " over ".join(pair),
-                    _number(part.seeds),
-                    Cell([estimate(part.difference, part.low, part.high, digits)]),
-                    _number(part.p_holm, 3),
-                    _number(part.p_equivalent_holm, 3),
-                    Cell(
-                        [estimate(part.probability, part.probability_low, part.probability_high, 2)]
-                    ),
-                    *(_number(value, digits) for value in margins),
-                    part.outcome,
-                ]
-            )
+    for answer, part in ((one, part) for one in answers for part in one.ways[how].parts):
+        # Of a return as many as the margin needs, which depends on the environment's scale.
+        of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
+        digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
+        pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
+        rows.append(
+            [
+                answer.claim,
+                "all" if len(part.environments) > 1 else part.environments[0],
+                names.get(part.metric, part.metric),
+                " over ".join(pair),
+                _number(part.seeds),
+                _estimate(vars(part), "difference", digits, ends=""),
+                *(_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)),
+                _estimate(vars(part), "probability", 2),
+                *(_number(part.in_paper, digits), _number(part.worth_mentioning, digits)),
+                _number(part.detectable, digits),
+                part.outcome,
+            ]
+        )
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
 
@@ -283,19 +263,19 @@ def costs(
     return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
 
 
-def table2(ppo: Mapping[str, PPOConfig], papers: Mapping[str, str]) -> pd.DataFrame:
+def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
     """The PPO hyperparameters, from the resolved settings of each environment.
 
-    The rows of the paper, by what they are called there, and Adam; then this project's further
-    settings. A value that is not the same in all environments is shown for each.
+    The rows of the paper and Adam; then this project's further settings, those without a label
+    named after their key. A value that is not the same in all environments is shown for each.
     """
-    own = [name for name in PPOConfig.model_fields if name not in papers]
-    rows: list[list[str | Cell]]
-    rows = [[label, _setting(ppo, name)] for name, label in papers.items()]
-    rows.append(["Optimizer", "Adam"])
+    own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
+    rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
+    rows += [["Optimizer", "Adam"]]
     rows += [
-        [OWN_SETTINGS.get(name, name.replace("_", " ").title()), _setting(ppo, name)]
-        for name in own
+        [own[name], _setting(ppo, name)]
+        for name in PPOConfig.model_fields
+        if name not in paper.rows
     ]
     return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
 
