@@ -25,7 +25,6 @@ from mace_rl.study.show.curves import (
     save_figure,
     seed_curves,
 )
-from mace_rl.study.show.svg import MAX_POINTS, _thinned
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
@@ -77,13 +76,6 @@ def test_a_seeds_curve_is_the_mean_of_the_episodes_so_far_and_ends_at_the_last(e
         assert curve["episode"].tolist() == sorted(kept)
         expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
         np.testing.assert_allclose(curve["moving_average"], expected[curve["episode"] - 1])
-
-
-def test_the_panels_of_the_page_are_thinned_and_end_at_the_last_episode():
-    frame = pd.DataFrame({"episode": np.tile(np.arange(1, 1002), 2), "variant": "ppo"})
-    kept = _thinned(frame)["episode"].to_numpy().reshape(2, -1)
-    assert (kept == np.arange(1001, 0, -math.ceil(1001 / MAX_POINTS))[::-1]).all()
-    assert len(kept[0]) <= MAX_POINTS == len(_thinned(frame.head(MAX_POINTS)))
 
 
 @pytest.mark.parametrize("shown", [RETURN, BETA], ids=["return", "beta"])

@@ -7,42 +7,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from invented import PAPERS, ROBUST, digits_of, table_for_claims
 
 from mace_rl.runs.run import run
-from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import read_study
-from mace_rl.study.show.cells import number
-from tools import kept_runs, tables
+from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
-SETTINGS = read_study([ROOT / "config.yaml"]).metrics
-SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 500})
-
-
-def test_the_first_study_stands_beside_this_one_part_by_part() -> None:
-    noise = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
-    first, second = (
-        ledger(table_for_claims(seeds, noise, 0.1), SETTINGS, PAPERS) for seeds in (11, 12)
-    )
-    page = tables.beside_the_first(first[2:], second)
-    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| C")]
-    said, parts = rows[:10], rows[10:]
-    for row, *claims in zip(said, second, [None, None, *first[2:]], strict=True):
-        now, before = (claim.ways[ROBUST].verdict if claim else "" for claim in claims)
-        assert row[-2:] == [before, now] if before else row[-1] == now
-    count = 0
-    for claim, other in zip(second[2:], first[2:], strict=True):
-        for part, old in zip(claim.ways[ROBUST].parts, other.ways[ROBUST].parts, strict=True):
-            row = parts[4 + count]  # C1 and C2 have two parts each
-            digits = digits_of(part)
-            assert [row[place] for place in (0, 4, 6, 7, 9)] == [
-                *(claim.claim, "12", part.outcome, "11", old.outcome)
-            ]
-            for place, found in ((5, part), (8, old)):
-                assert row[place].startswith(f"{number(found.difference, digits)} (")
-            count += 1
-    assert count == len(parts) - 4
 
 
 @pytest.mark.slow

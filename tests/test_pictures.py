@@ -1,13 +1,11 @@
 """Pictures of all runs at once: their data against loops, and that each can be drawn."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from invented import CLAIMS, SEEDS, table_for_claims, table_for_questions, table_for_scores
-from matplotlib.figure import Figure
 
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.statistics import mean_interval
@@ -15,9 +13,8 @@ from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import Study, read_study
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
-from mace_rl.study.show.curves import PlotStyle, figure_as_svg, save_figure
+from mace_rl.study.show.curves import PlotStyle, save_figure
 from mace_rl.study.show.pictures import PICTURES, Source
-from mace_rl.study.show.svg import svg
 
 CONSTANTS = ["beta_1", "ppo"]
 ROOT = Path(__file__).parents[1]
@@ -125,19 +122,3 @@ def test_every_picture_can_be_drawn_and_is_the_same_again(
     for path, data in (("a.png", table), ("b.png", read)):
         save_figure(PICTURES[name].draw(data, look), tmp_path / path)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
-def test_a_panel_of_the_page_says_and_shows_what_the_figure_does() -> None:
-    figure = Figure(figsize=(3, 2))
-    axes = figure.subplots()
-    axes.plot([0.975, 0.995], [0.123456, 0.2], alpha=0.19)
-    axes.set_yticks([0.125, 0.175])
-    whole, small = figure_as_svg(figure), svg(figure, "name", "label")
-    for shown in (r"<text[^>]*>([^<]*)<", r"opacity: ([\d.]+)", r"stroke-width: ([\d.]+)"):
-        assert re.findall(shown, small) == re.findall(shown, whole) != []
-    paths = [
-        re.findall(r"-?\d+(?:\.\d+)?", " ".join(re.findall(r' d="([^"]+)"', text)))
-        for text in (whole, small)
-    ]
-    np.testing.assert_allclose(*(np.array(path, float) for path in paths), atol=0.1)
-    assert max(len(number.partition(".")[2]) for number in paths[1]) == 1

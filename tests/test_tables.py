@@ -92,16 +92,6 @@ def test_summary_against_pandas_and_scipy() -> None:
     assert other["paper"].isna().all()
 
 
-def test_no_cell_depends_on_another_environment_or_variant() -> None:
-    """Bootstrap intervals included: more columns do not change a number."""
-    all_of_it = metrics(seeds=12)
-    part = all_of_it[(all_of_it["env"] == "CartPole-v1") & (all_of_it["variant"] == "mace_full")]
-    alone, among = table1(part, SETTINGS), table1(all_of_it, SETTINGS)
-    among = among[(among["env"] == "CartPole-v1") & (among["variant"] == "mace_full")]
-    alone, among = (frame.reset_index(drop=True) for frame in (alone, among))
-    pd.testing.assert_frame_equal(alone, among, check_exact=True)
-
-
 def test_table_1_has_bold_ties_censored_means_and_the_papers_numbers() -> None:
     speeds = {"ppo": [1, 2, 3], "mace_fixed": [120] * 3, "mace_full": [104] * 3}
     ends = {"ppo": [600] * 3, "mace_fixed": [600, 600, 601], "mace_full": [2000] * 3}
@@ -330,18 +320,14 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, PAPERS)
     shown = [*of_ledger(claims, CLAIMS), *of_runs(data, CLAIMS, SETTINGS, {})]
     page = markdown_page("Tables", "Made by hand.", shown, ["figure1"])
-    sections = re.findall("(?m)^## (.*)", page)
-    assert len(sections) == len(set(sections))
+    assert page.startswith("# Tables\n\nMade by hand.\n\n![figure1](figure1.png)\n\n## The paper's")
+    titles = re.findall("(?m)^## (.*)", page)
+    assert len(titles) == len(set(titles))
     assert re.findall("(?m)^### Part by part: (.*)", page) == [LITERAL, ROBUST]
-    assert "![figure1](figure1.png)" in page and "Made by hand." in page
     assert f"{LITERAL}: 0 reproduced, 0 reversed, 10 not reproduced, 0 open" in page
     row = data["comparisons"].set_index(["env", "metric", "variant", "baseline"])
     row = row.loc["CartPole-v1", "area_under_curve", "mace_full", "ppo"]
-    low, high = number(row["probability_low"], 2), number(row["probability_high"], 2)
-    assert f"{number(row['probability'], 2)} ({low} to {high})" in page
     assert f"| {number(row['p_value'], 4)} | {number(row['p_holm'], 4)} |" in page
-    score = data["aggregate"].iloc[0]
-    assert f"{number(score['mean'], 3)} ({number(score['mean_low'], 3)} to" in page
     assert "| mace_full | 10 | 0.50, 0.50, 0.50 | 0.00, 0.45, 0.90 |" in page
     for part in (part for claim in claims for part in claim.ways[ROBUST].parts):
         digits = digits_of(part)
