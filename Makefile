@@ -215,7 +215,7 @@ audit: ## known vulnerabilities of what the locks pin (asks a vulnerability serv
 
 clean: ## remove the environments and caches; never results/ or Snakemake's records
 	@rm -rf .venv .venv-purejaxrl .python setup.log build src/*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find benchmarks src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
+	find benchmarks extras src tests tools workflow -name __pycache__ -prune -exec rm -rf {} +
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

@@ -17,11 +17,11 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
 import mace_rl.environments  # noqa: F401  (registers ours)
+from extras.random_beta import RandomBeta
 from mace_rl.beta.controller import BetaController
-from mace_rl.beta.controls import RandomDraw
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.config.beta import ConstantBeta, RandomBeta
+from mace_rl.config.beta import ConstantBeta
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import CuriosityConfig, defaults
@@ -38,9 +38,11 @@ SMALL = {
     "memory": {"capacity": 60, "write_every": 3},
     "novelty": {"buffer_size": 120, "write_every": 2, "neighbours": [3, 8, 5], "refresh_every": 30},
 }
-RANDOM = {"kind": "random", "low": 0.2, "high": 0.7}
-BANDIT = {"kind": "bandit", "arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
 OWN = {"kind": "custom", "rule": "test_wrappers:Own"}
+LIMITS = {"low": 0.2, "high": 0.7}
+RANDOM = {"kind": "custom", "rule": "extras.random_beta:RandomBeta", "arguments": LIMITS}
+ARMS = {"arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
+BANDIT = {"kind": "custom", "rule": "extras.bandit:Bandit", "arguments": ARMS}
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 
@@ -111,7 +113,7 @@ def test_pays_what_the_trainer_s_curiosity_gives_for_whole_episodes(name, beta):
     paid = play(env, steps)
     rule = Constant(ConstantBeta(kind="constant", value=0.3))
     if beta == RANDOM:
-        rule = RandomDraw(RandomBeta(**RANDOM), Streams(5)["beta"])
+        rule = RandomBeta(Streams(5)["beta"], **LIMITS)
     space = bare.observation_space
     expected = ByEpisodes(space, flatdim(space), rule, seed=5)
     states, rewards, episodes = [bare.reset(seed=0)[0]], [], 0
@@ -365,7 +367,7 @@ def test_defaults_are_the_study_s():
             {"beta": OWN | {"arguments": {"learns": True}}},
             "beta.rule has 'test_wrappers:Own', which learns from policy gradients",
         ),
-        ({"beta": {"kind": "none"}}, "'none'.*'constant', 'random', 'bandit'"),
+        ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),
         ({"beta": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
         ({"memory": {"capcity": 5}}, "unknown key 'memory.capcity' .* 'capacity'"),
         ({"memory": 5}, "memory is 5, but"),
@@ -415,7 +417,7 @@ PAIR = vector_of("CartPole-v1", 2, NEXT)
         (CuriosityReward, [TWO_ACTIONS], ConfigError, "has actions MultiD"),
         # stable-baselines3's are none of Gymnasium's.
         (CuriosityReward, [make_vec_env("CartPole-v1", 2)], TypeError, "Expected env to be"),
-        (VectorCuriosityReward, [PAIR, BANDIT], ConfigError, "bandit.*2 go on at once"),
+        (VectorCuriosityReward, [PAIR, BANDIT], ConfigError, "Bandit.*2 go on at once"),
         (VectorCuriosityReward, [without_a_mode()], ConfigError, "should be one of gymnasium"),
     ],
 )

@@ -12,8 +12,9 @@ from gymnasium.spaces import Discrete
 from mace_rl.agent.advantages import generalised_advantages
 from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
+from mace_rl.beta.controller import BetaController
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.config.beta import BanditBeta, CustomBeta
+from mace_rl.config.beta import CustomBeta
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
@@ -68,20 +69,13 @@ class CuriosityTracker:
         space, size = spaces.observation_space, spaces.observation_size
         memory = config.memory if config.relevance else None
         self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
-        self.controller = beta_rule(config.beta, config.rollout_steps, streams["beta"])
-        if isinstance(config.beta, CustomBeta) and self.controller.learns:
-            raise ConfigError(
-                f"beta.rule has {config.beta.rule!r}, which learns from policy gradients, but only "
-                "our trainer has these"
-            )
-        if isinstance(config.beta, BanditBeta) and environments > 1:
-            raise ConfigError(
-                "beta.kind is 'bandit', which learns from each episode before the next begins, but "
-                f"here {environments} go on at once: wrap each environment in a CuriosityReward"
-            )
+        self.controller = beta_rule(config.beta, streams["beta"])
+        if isinstance(config.beta, CustomBeta):
+            require_usable(config.beta.rule, self.controller, environments)
         # Of the extrinsic rewards and of the curiosity bonus.
         self.scales = RewardScale(config.discount, 1.0), RewardScale(config.discount, TINY)
         self.recordings: list[Recording | None] = [None] * environments
+        self.steps = 0  # since the agent's last update, of whole episodes
 
     @property
     def unit(self) -> float:
@@ -135,6 +129,10 @@ class CuriosityTracker:
         returns = generalised_advantages(episode.rewards, values, self.config.discount, 1.0)
         self.curiosity.remember(episode, returns)
         self.controller.next_episode(episode, bonus)
+        self.steps += len(episode)
+        if self.steps >= self.config.rollout_steps:
+            self.controller.end_rollout()
+            self.steps = 0
 
     def described(self) -> dict[str, Any]:
         """What a state has to agree in with the one who loads it."""
@@ -143,7 +141,7 @@ class CuriosityTracker:
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 3,  # of the state itself
+            "form": 4,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -154,6 +152,7 @@ class CuriosityTracker:
             "controller": self.controller.state_dict(),
             "scales": [scale.state_dict() for scale in self.scales],
             "recordings": [None if one is None else one.state_dict() for one in self.recordings],
+            "steps": self.steps,
         }
         return copy.deepcopy(state)  # the training may go on before this is saved
 
@@ -171,8 +170,23 @@ class CuriosityTracker:
         state = copy.deepcopy(state)
         self.curiosity.load_state_dict(state["curiosity"])
         self.controller.load_state_dict(state["controller"])
+        self.steps = state["steps"]
         for scale, saved in zip(self.scales, state["scales"], strict=True):
             scale.load_state_dict(saved)
         self.recordings = [
             None if saved is None else Recording.from_state(saved) for saved in state["recordings"]
         ]
+
+
+def require_usable(rule: str, controller: BetaController, environments: int) -> None:
+    """Raise `ConfigError` for a rule of the user's own that asks for what a wrapper has not."""
+    if controller.learns:
+        raise ConfigError(
+            f"beta.rule has {rule!r}, which learns from policy gradients, but only our trainer has "
+            "these"
+        )
+    if controller.one_at_a_time and environments > 1:
+        raise ConfigError(
+            f"beta.rule has {rule!r}, which learns from each episode before the next begins, but "
+            f"here {environments} go on at once: wrap each environment in a CuriosityReward"
+        )

@@ -13,26 +13,20 @@ from mace_rl.agent.policy import Policy
 from mace_rl.agent.ppo import PPO
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.beta.controller import BetaController
-from mace_rl.beta.controls import RandomDraw, SlidingWindowBandit
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.bonus.hashing import HashCounts
-from mace_rl.bonus.icm import IntrinsicCuriosityModule
 from mace_rl.bonus.intrinsic import IntrinsicReward
-from mace_rl.bonus.rnd import RandomNetworkDistillation
 from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.beta import (
-    BanditBeta,
     BetaRule,
     ConstantBeta,
     CustomBeta,
     ExponentialBeta,
     MetaBeta,
     NoBonus,
-    RandomBeta,
 )
-from mace_rl.config.bonus import CuriosityBonus, CustomBonus, HashCountsBonus, ICMBonus, RNDBonus
+from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
@@ -52,20 +46,14 @@ def beta_controller(
             assert config.meta is not None  # what a variant uses is there: `RunConfig`
             return MetaAdaptation(config.meta, initial, environment, streams["meta"])
         case rule:
-            return beta_rule(rule, config.ppo.rollout_steps, streams["beta"])
+            return beta_rule(rule, streams["beta"])
 
 
-def beta_rule(
-    settings: BetaRule, rollout_steps: int, generator: np.random.Generator
-) -> BetaController:
-    """What sets β without a network of ours; `rollout_steps`: between updates of the policy."""
+def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
+    """What sets β without a network of ours."""
     match settings:
         case ConstantBeta():
             return Constant(settings)
-        case RandomBeta():
-            return RandomDraw(settings, generator)
-        case BanditBeta():
-            return SlidingWindowBandit(settings, rollout_steps, generator)
         case ExponentialBeta():
             return ExponentialSchedule(settings)
         case CustomBeta(rule=rule, arguments=arguments):
@@ -76,22 +64,15 @@ def intrinsic_reward(
     config: RunConfig, environment: Environment, streams: Streams
 ) -> IntrinsicReward | None:
     """What β weighs: the curiosity bonus with its memory and novelty, or another; None in PPO."""
-    space, size = environment.observation_space, environment.observation_size
-    actions, generator = environment.action_space, streams["bonus"]
     match config.bonus:
         case None:
             return None
         case CuriosityBonus():
             assert config.novelty is not None  # as above
+            space, size = environment.observation_space, environment.observation_size
             return Curiosity(config.memory, config.novelty, space, size, streams)
-        case ICMBonus():
-            return IntrinsicCuriosityModule(config.bonus, space, actions, size, generator)
-        case RNDBonus():
-            return RandomNetworkDistillation(config.bonus, space, size, generator)
-        case HashCountsBonus():
-            return HashCounts(config.bonus, space, size, generator)
         case CustomBonus(estimator=estimator, arguments=arguments):
-            key, own = "bonus.estimator", (size, actions, generator)
+            key, own = "bonus.estimator", (environment, streams["bonus"])
             return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 

@@ -166,7 +166,10 @@ class Trainer:
         preconditions it. Shown are dg/dβ of each episode, preconditioned alike, and g_E, that of
         the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
         """
-        if self.controller is None or not self.controller.learns:
+        if self.controller is None:
+            return None
+        self.controller.end_rollout()
+        if not self.controller.learns:
             return None
         centred = self.config.ppo.centre_advantages
         extrinsic = np.concatenate([item.extrinsic_part for item in rollout])

@@ -13,7 +13,7 @@ from mace_rl import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
 from mace_rl.study.config import folder_of, load_study
-from mace_rl.config.plugins import code_outside, source_file
+from mace_rl.config.plugins import code_outside, source_files
 from mace_rl.environments import registered
 from mace_rl.study.claims_config import read_claims
 from mace_rl.study.measure.metrics import all_metrics
@@ -135,4 +135,5 @@ def code(script, settings=None):
     part = "training" if script == "train.py" else "everything"
     scripts = [Path(workflow.basedir, "workflow", "scripts", name) for name in (script, "job.py")]
     named = settings.references() if settings else {}
-    return digest(part, *scripts, *(source_file(name, key) for key, name in named.items()))
+    own = (file for key, name in named.items() for file in source_files(name, key))
+    return digest(part, *scripts, *own)

@@ -18,10 +18,12 @@ class Effect(NamedTuple):
 class BetaController(ABC):
     """Sets β for the next episode from what happened in the last.
 
-    One of the user's own is made as Class(generator, **arguments).
+    One of the user's own is made as Class(generator, **arguments); it raises `ConfigError` for
+    arguments that it cannot use.
     """
 
     learns = False  # whether `learn` wants policy gradients
+    one_at_a_time = False  # whether every episode has to end before the next begins
 
     @property
     @abstractmethod
@@ -31,6 +33,10 @@ class BetaController(ABC):
     @abstractmethod
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """Take in a finished episode and its curiosity bonus, [T]; `beta` is then the next's."""
+
+    def end_rollout(self) -> None:
+        """After the last `next_episode` before an update of the policy, and before `learn`."""
+        return  # most rules do not ask when the policy changes
 
     def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
         """After each rollout, before the policy's update on it: what the βs do to the policy.

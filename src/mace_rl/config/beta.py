@@ -1,6 +1,6 @@
 """Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
@@ -31,40 +31,6 @@ class ConstantBeta(Section):
 
     kind: Literal["constant"]
     value: float = Field(ge=0, le=1)
-
-
-class RandomBeta(Section):
-    """β uniform between `low` and `high`, drawn for every episode."""
-
-    kind: Literal["random"]
-    low: float = Field(ge=0, le=1)
-    high: float = Field(ge=0, le=1)
-
-    @model_validator(mode="after")
-    def _in_order(self) -> "RandomBeta":
-        if self.low > self.high:
-            raise ValueError(f"low is {self.low}, which must not exceed high, {self.high}")
-        return self
-
-
-class BanditBeta(Section):
-    """β from a bandit that follows the returns (Badia et al. 2020, appendix D)."""
-
-    kind: Literal["bandit"]
-    arms: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=1)  # the βs to choose from
-    window: Count  # pulls that count, the last ones
-    exploration: NonNegativeFloat  # of the bonus √(1 / pulls), in ranges of the return
-    epsilon: float = Field(ge=0, le=1)  # probability of an arm at random
-
-    @model_validator(mode="after")
-    def _arms_fit(self) -> "BanditBeta":
-        if len(set(self.arms)) < len(self.arms):
-            raise ValueError(f"arms has a β twice: {self.arms}")
-        if self.window < len(self.arms):
-            raise ValueError(
-                f"window is {self.window}, which must hold each of the {len(self.arms)} arms"
-            )
-        return self
 
 
 class ExponentialBeta(Section):
@@ -102,5 +68,5 @@ class CustomBeta(Section):
     arguments: Arguments = Field(default={})
 
 
-BetaRule = ConstantBeta | RandomBeta | BanditBeta | ExponentialBeta | CustomBeta
+BetaRule = ConstantBeta | ExponentialBeta | CustomBeta
 BetaConfig = NoBonus | MetaBeta | BetaRule

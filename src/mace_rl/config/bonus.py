@@ -69,40 +69,10 @@ class CuriosityBonus(Section):
     relevance: bool = True
 
 
-class ICMBonus(Section):
-    """Intrinsic curiosity module (Pathak et al. 2017): `mace_rl.bonus.icm`."""
-
-    kind: Literal["icm"]
-    feature_units: Units = 32  # numbers in φ(s); the paper has 288 for images
-    hidden_units: Units = 64  # of the one hidden layer in each of its three networks
-    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper's
-    batch_size: Count = 64  # steps; each episode is learnt from once
-    forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
-    scale: PositiveFloat = 1.0  # η
-
-
-class RNDBonus(Section):
-    """Random network distillation (Burda et al. 2018): `mace_rl.bonus.rnd`."""
-
-    kind: Literal["rnd"]
-    feature_units: Units = 64  # outputs of both networks; the paper has 512 for images
-    hidden_units: Units = 64  # of the one hidden layer in each
-    learning_rate: PositiveFloat = Field(default=0.001, lt=1)  # the paper has 0.0001, for images
-    batch_size: Count = 64  # steps; each episode is learnt from once
-
-
-class HashCountsBonus(Section):
-    """Counts of hashed states (Tang et al. 2017): `mace_rl.bonus.hashing`."""
-
-    kind: Literal["hash_counts"]
-    bits: int = Field(default=16, ge=1, le=62)  # k; more tell more states apart
-    calibration_states: Count = 1000  # the first visited; states are hashed in their units
-
-
 class CustomBonus(Section):
     """A bonus from the class `estimator`, a `mace_rl.bonus.intrinsic.IntrinsicReward`.
 
-    It is made as estimator(size, action_space, generator, **arguments).
+    It is made as estimator(spaces, generator, **arguments).
     """
 
     kind: Literal["custom"]
@@ -110,4 +80,4 @@ class CustomBonus(Section):
     arguments: Arguments = Field(default={})
 
 
-BonusConfig = CuriosityBonus | ICMBonus | RNDBonus | HashCountsBonus | CustomBonus
+BonusConfig = CuriosityBonus | CustomBonus

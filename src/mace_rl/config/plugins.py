@@ -70,7 +70,7 @@ def make(
 
     It has to be a subclass of `kind`; with `functions` also a function that returns a `kind`, but
     none of Python's or of this package. `ConfigError` for what is neither, before it is called, and
-    for what does not take these arguments.
+    for what does not take these arguments, or says so itself.
     """
     factory: Any = load(reference, key)
     if isinstance(factory, FunctionType):
@@ -86,7 +86,10 @@ def make(
         inspect.signature(factory).bind(*given, **arguments)
     except TypeError as error:
         raise ConfigError(f"{key} has {reference!r} with {arguments}: {error}") from None
-    return factory(*given, **arguments)
+    try:
+        return factory(*given, **arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{key} has {reference!r}: {error}") from None
 
 
 def import_module(reference: str, key: str) -> ModuleType:
@@ -102,8 +105,11 @@ def import_module(reference: str, key: str) -> ModuleType:
         raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
 
 
-def source_file(reference: str, key: str) -> Path:
-    """The Python file of the module in "package.module:Name", found without importing it."""
+def source_files(reference: str, key: str) -> list[Path]:
+    """The Python file of the module in "package.module:Name", found without importing it.
+
+    With it come those beside it in a package, which it may share code with.
+    """
     _look_here_too()
     module = reference.partition(":")[0]
     try:
@@ -115,7 +121,9 @@ def source_file(reference: str, key: str) -> Path:
             f"{key} has {reference!r}, but there is no Python module {module!r}, neither installed "
             f"nor in {os.getcwd()}"
         )
-    return Path(spec.origin)
+    file = Path(spec.origin)
+    in_package = (file.parent / "__init__.py").exists()
+    return sorted(file.parent.glob("*.py")) if in_package else [file]
 
 
 def _look_here_too() -> None:

@@ -91,10 +91,10 @@ def unused_sections(settings: Any) -> dict[str, str]:
     if beta == "none":
         return dict.fromkeys((*BONUS_SECTIONS, "meta"), "beta.kind 'none'")
     unused = {}
-    if beta in ("constant", "random", "bandit", "exponential", "custom"):
+    if beta in ("constant", "exponential", "custom"):
         unused["meta"] = f"beta.kind {beta!r}"
     if value("bonus", "relevance") is False:
         unused["memory"] = "bonus.relevance false"
-    if bonus in ("icm", "rnd", "hash_counts", "custom"):
-        unused |= dict.fromkeys(("memory", "novelty"), f"bonus.kind {bonus!r}")
+    if bonus == "custom":
+        unused |= dict.fromkeys(("memory", "novelty"), "bonus.kind 'custom'")
     return unused

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 from mace_rl.refusal import Refusal
 
 Model = TypeVar("Model", bound=BaseModel)
+MOVED = ("icm", "rnd", "hash_counts", "random", "bandit")  # kinds that are plugins now
 
 
 class ConfigError(Refusal, ValueError):
@@ -110,6 +111,8 @@ def short_repr(value: Any) -> str:
 def _advice(problem: ErrorDetails) -> str:
     """For what YAML takes for something else than is meant."""
     wanted, value = problem["type"], problem["input"]
+    if wanted == "union_tag_invalid" and problem["ctx"]["tag"] in MOVED:
+        return ", and extras/ has this one, as kind: custom (docs/extending.md)"
     if wanted == "string_type" and isinstance(value, bool | int | float):
         return " (YAML takes it for text where it stands in quotes)"
     if wanted == "bool_type" and isinstance(value, str):

@@ -27,7 +27,7 @@ class CuriosityConfig(Section):
     memory: MemoryConfig  # what differs from `defaults`
     novelty: NoveltyConfig  # what likewise
     discount: float = Field(default=0.99, ge=0, le=1)  # γ of the agent
-    rollout_steps: Count = 1  # steps between updates of the agent; for the bandit
+    rollout_steps: Count = 1  # steps between updates of the agent
     seed: int = Field(default=0, ge=0, lt=2**32)
 
     @model_validator(mode="before")
@@ -49,6 +49,6 @@ class CuriosityConfig(Section):
         if beta.get("kind") == "meta":
             raise ValueError(
                 "the meta network learns from policy gradients, which only our trainer has: kind "
-                "should be constant, exponential, random, bandit or custom"
+                "should be constant, exponential or custom"
             )
         return beta

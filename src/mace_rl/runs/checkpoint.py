@@ -6,6 +6,7 @@ it belongs to (configuration, code, versions); one of another identity is never 
 
 import hashlib
 import io
+import sys
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
@@ -31,8 +32,21 @@ def archive(content: dict[str, Any]) -> bytes:
     Equal content gives equal bytes.
     """
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    torch.save(_unshared(content), buffer)
     return buffer.getvalue()
+
+
+def _unshared(content: Any) -> Any:
+    """The same with one object for equal strings, and one each for equal lists and dictionaries.
+
+    Pickle writes an object that comes again as a reference, an equal one in full.
+    """
+    kind = type(content)
+    if kind is dict:
+        return {_unshared(key): _unshared(value) for key, value in content.items()}
+    if kind is list or kind is tuple:
+        return kind(map(_unshared, content))
+    return sys.intern(content) if kind is str else content
 
 
 def unarchive(data: bytes, origin: Path) -> dict[str, Any]:

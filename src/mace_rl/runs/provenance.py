@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl import sources
-from mace_rl.config.plugins import source_file
+from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.refusal import Refusal
 
@@ -40,8 +40,10 @@ class ProvenanceError(Refusal, ValueError):
 
 def sources_of(config: RunConfig) -> str:
     """The digest of all code that a run depends on, the user's own included."""
-    own = (source_file(reference, key) for key, reference in config.references().items())
-    return sources.digest("training", *own)
+    named = config.references().items()
+    return sources.digest(
+        "training", *(file for key, name in named for file in source_files(name, key))
+    )
 
 
 def file_digest(path: Path) -> str:

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import gymnasium
 from pydantic import AfterValidator, Field, ValidationError
 
-from mace_rl.config.plugins import import_module, load, source_file
+from mace_rl.config.plugins import import_module, load, source_files
 from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, explain, short_repr
@@ -243,7 +243,7 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
         name = max(reversed(layers), key=lambda name: _depth(layers[name], location))
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
-        source_file(reference, f"in the settings of {environment} and {variant}, {key}")
+        source_files(reference, f"in the settings of {environment} and {variant}, {key}")
     for section, reason in unused_sections(config).items():
         if section in study.variant_settings[variant].settings:
             raise ConfigError(

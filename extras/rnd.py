@@ -1,41 +1,45 @@
 """Random network distillation, RND (Burda et al. 2018)."""
 
 import math
+from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
 
-from mace_rl.bonus.intrinsic import PredictionError
-from mace_rl.config.bonus import RNDBonus
+from extras.prediction_error import PredictionError, PredictorSettings
+from mace_rl.config.section import Units, check
 from mace_rl.environments.rollout import Episode
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, mlp
 from mace_rl.numerics.products import dot
 
 
-class RandomNetworkDistillation(PredictionError):
+class Settings(PredictorSettings):
+    """The arguments of `RND`."""
+
+    feature_units: Units = 64  # outputs of both networks; the paper has 512 for images
+
+
+class RND(PredictionError):
     """How badly a network predicts the features that a fixed random network gives a state.
 
     The bonus is the mean squared error of the features of s' (section 2.2), on which the predictor
     is trained too. Its size means nothing: `ppo.scale_rewards` divides it by the running standard
     deviation of its returns, as section 2.4 asks. Unlike there its returns end with the episode, as
     those of every bonus here, so that only the bonus differs.
+
+    Raises `ConfigError` for arguments that are not as `Settings` has them.
     """
 
     STATE = (*PredictionError.STATE, "fixed")
 
-    def __init__(
-        self,
-        config: RNDBonus,
-        observation_space: Box | Discrete,
-        observation_size: int,
-        generator: np.random.Generator,
-    ) -> None:
-        sizes = [observation_size, config.hidden_units, config.feature_units]
+    def __init__(self, spaces: Spaces, generator: np.random.Generator, **arguments: Any) -> None:
+        settings = check(Settings, arguments, "arguments")
+        sizes = [spaces.observation_size, settings.hidden_units, settings.feature_units]
         self.target, self.network = (
             CompiledMLP(mlp(sizes, math.sqrt(2), generator)) for _ in range(2)
         )
         self.fixed, parameters = self.target.parameters, self.network.parameters
-        super().__init__(config, parameters, observation_space, observation_size, generator)
+        super().__init__(settings, parameters, spaces, generator)
 
     def inputs(self, episode: Episode) -> np.ndarray:
         """The states that the steps led to, whitened."""

@@ -1,17 +1,29 @@
 """The intrinsic curiosity module, ICM (Pathak et al. 2017)."""
 
-import numpy as np
-from gymnasium.spaces import Box, Discrete
+from typing import Any
 
+import numpy as np
+from gymnasium.spaces import Discrete
+from pydantic import Field, PositiveFloat
+
+from extras.prediction_error import PredictionError, PredictorSettings
 from mace_rl.agent.distribution import log_prob_gradient
-from mace_rl.bonus.intrinsic import PredictionError
-from mace_rl.config.bonus import ICMBonus
+from mace_rl.config.section import Units, check
 from mace_rl.environments.rollout import Episode
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, mlp
 from mace_rl.numerics.products import dot
 
 
-class IntrinsicCuriosityModule(PredictionError):
+class Settings(PredictorSettings):
+    """The arguments of `ICM`."""
+
+    feature_units: Units = 32  # numbers in φ(s); the paper has 288 for images
+    forward_weight: float = Field(default=0.2, ge=0, le=1)  # β of its equation 7, the paper's
+    scale: PositiveFloat = 1.0  # η
+
+
+class ICM(PredictionError):
     """How badly the forward model predicts the features of the next state: η L_F (equation 6).
 
     Features φ of states come from a network, and two others learn them, each with one hidden layer:
@@ -24,27 +36,19 @@ class IntrinsicCuriosityModule(PredictionError):
 
     All are trained together on (1 - `forward_weight`) L_I + `forward_weight` L_F (equation 7,
     without the policy's term, which is PPO's here).
+
+    Raises `ConfigError` for arguments that are not as `Settings` has them.
     """
 
-    config: ICMBonus
+    def __init__(self, spaces: Spaces, generator: np.random.Generator, **arguments: Any) -> None:
+        settings = check(Settings, arguments, "arguments")
 
-    def __init__(
-        self,
-        config: ICMBonus,
-        observation_space: Box | Discrete,
-        action_space: Box | Discrete,
-        observation_size: int,
-        generator: np.random.Generator,
-    ) -> None:
         def new(inputs: int, outputs: int) -> CompiledMLP:
-            return CompiledMLP(mlp([inputs, config.hidden_units, outputs], 1.0, generator))
+            return CompiledMLP(mlp([inputs, settings.hidden_units, outputs], 1.0, generator))
 
-        if isinstance(action_space, Discrete):
-            actions, stds = int(action_space.n), 0
-        else:
-            actions = stds = action_space.shape[0]
-        features = config.feature_units
-        self.features = new(observation_size, features)
+        size, actions = spaces.observation_size, spaces.action_size
+        features = settings.feature_units
+        self.features = new(size, features)
         self.inverse_model = new(2 * features, actions)
         self.forward_model = new(features + actions, features)
         networks = self.features, self.inverse_model, self.forward_model
@@ -52,15 +56,16 @@ class IntrinsicCuriosityModule(PredictionError):
         parameters = np.empty(ends[-1], np.float32)
         for one, memory in zip(networks, np.split(parameters, ends[:-1]), strict=True):
             one.move_to(memory)
-        super().__init__(config, parameters, observation_space, observation_size, generator)
-        self.action_space = action_space
-        self.log_std = np.zeros(stds, np.float32)  # of the inverse model
-        self.ends = np.cumsum([observation_size, observation_size])  # of s and s' in `inputs`
+        super().__init__(settings, parameters, spaces, generator)
+        self.discrete = isinstance(spaces.action_space, Discrete)
+        # Of the inverse model.
+        self.log_std = np.zeros(0 if self.discrete else actions, np.float32)
+        self.ends = np.cumsum([size, size])  # of s and s' in `inputs`
 
     def inputs(self, episode: Episode) -> np.ndarray:
         """s and s', whitened, and the action as the environment took it, side by side."""
         seen = self.whiten(episode.observations)
-        space = self.action_space
+        space = self.spaces.action_space
         if isinstance(space, Discrete):
             actions = np.eye(int(space.n), dtype=np.float32)[episode.actions]
         else:
@@ -73,18 +78,18 @@ class IntrinsicCuriosityModule(PredictionError):
         before = self.features.forward(state).outputs
         predicted = self.forward_model.forward(np.hstack([before, action])).outputs
         difference = predicted - self.features.forward(next_state).outputs
-        return self.config.scale * np.array([0.5 * dot(row, row) for row in difference])
+        return self.settings.scale * np.array([0.5 * dot(row, row) for row in difference])
 
     def gradient(self, inputs: np.ndarray) -> np.ndarray:
         """Of the mean of the joint loss, which reaches the features through both models."""
-        count, weight = len(inputs), self.config.forward_weight
+        count, weight = len(inputs), self.settings.forward_weight
         state, next_state, action = np.split(inputs, self.ends, axis=1)
         features = self.features.forward(np.concatenate([state, next_state]))
         before, after = features.outputs[:count], features.outputs[count:]
         inverse = self.inverse_model.forward(np.hstack([before, after]))
         forward = self.forward_model.forward(np.hstack([before, action]))
 
-        taken = action if len(self.log_std) else action.argmax(1)
+        taken = action.argmax(1) if self.discrete else action
         weights, unused = np.full(count, (weight - 1) / count, np.float32), self.log_std.copy()
         grad, _ = log_prob_gradient(inverse.outputs, self.log_std, taken, weights, 0.0, unused)
         grad_action = np.ascontiguousarray(grad[:, : action.shape[1]])

@@ -1,41 +1,43 @@
-"""Controls of the learned β: what it must beat, a draw of chance and a bandit."""
+"""β by a bandit that follows the returns (Badia et al. 2020, appendix D)."""
 
 import math
 from collections import deque
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, ValidationInfo, field_validator
 
 from mace_rl.beta.controller import BetaController
-from mace_rl.config.beta import BanditBeta, RandomBeta
+from mace_rl.config.section import Count, Section, check
 from mace_rl.environments.rollout import Episode
 from mace_rl.numerics.arrays import total
 from mace_rl.state import Stateful
 
 
-class RandomDraw(Stateful, BetaController):
-    """β uniform in [low, high), drawn anew for every episode."""
+class Settings(Section):
+    """The arguments of `Bandit`."""
 
-    STATE = ("_beta", "generator")
+    arms: list[Annotated[float, Field(ge=0, le=1)]] = Field(min_length=1)  # the βs to choose from
+    window: Count  # pulls that count, the last ones
+    exploration: NonNegativeFloat  # of the bonus √(1 / pulls), in ranges of the return
+    epsilon: float = Field(ge=0, le=1)  # probability of an arm at random
 
-    def __init__(self, config: RandomBeta, generator: np.random.Generator) -> None:
-        self.config, self.generator = config, generator
-        self._beta = self.draw()
+    @field_validator("arms")
+    @classmethod
+    def _differ(cls, arms: list[float]) -> list[float]:
+        if len(set(arms)) < len(arms):
+            raise ValueError("should have each β once")
+        return arms
 
-    @property
-    def beta(self) -> float:
-        """See `BetaController`."""
-        return self._beta
-
-    def draw(self) -> float:
-        """One β."""
-        return float(self.generator.uniform(self.config.low, self.config.high))
-
-    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
-        """See `BetaController`."""
-        self._beta = self.draw()
+    @field_validator("window")
+    @classmethod
+    def _holds_the_arms(cls, window: int, before: ValidationInfo) -> int:
+        if window < len(arms := before.data.get("arms", [])):
+            raise ValueError(f"should hold each of the {len(arms)} arms")
+        return window
 
 
-class SlidingWindowBandit(Stateful, BetaController):
+class Bandit(Stateful, BetaController):
     """β by Agent57's bandit: sliding-window UCB with ε-greedy (Badia et al. 2020, appendix D).
 
     Each arm a is a β. Every arm is pulled once, in order; then, with N(a) the pulls of an arm among
@@ -47,46 +49,47 @@ class SlidingWindowBandit(Stateful, BetaController):
     episodes, so an arm is pulled for a rollout (one episode if `rollout_steps` is 1) and paid what
     the next rollout's episodes return, on average. Returns count from the worst, 0, to the best, 1,
     of all episodes so far, so that `exploration` means the same in every task.
+
+    Raises `ConfigError` for arguments that are not as `Settings` has them.
     """
 
-    STATE = ("arm", "pulls", "unpaid", "paid", "worst", "best", "returns", "steps", "generator")
+    STATE = ("arm", "pulls", "unpaid", "paid", "worst", "best", "returns", "generator")
 
-    def __init__(
-        self, config: BanditBeta, rollout_steps: int, generator: np.random.Generator
-    ) -> None:
-        self.config, self.rollout_steps, self.generator = config, rollout_steps, generator
+    one_at_a_time = True
+
+    def __init__(self, generator: np.random.Generator, **arguments: Any) -> None:
+        self.settings, self.generator = check(Settings, arguments, "arguments"), generator
         self.arm, self.pulls = 0, 1
         self.unpaid: int | None = None  # the last rollout's arm, for which this one's returns speak
-        self.paid: deque[tuple[int, float]] = deque(maxlen=config.window)  # arm, return
+        self.paid: deque[tuple[int, float]] = deque(maxlen=self.settings.window)  # arm, return
         self.worst, self.best = math.inf, -math.inf
         self.returns: list[float] = []  # of this rollout's episodes
-        self.steps = 0  # of this rollout
 
     @property
     def beta(self) -> float:
         """See `BetaController`."""
-        return self.config.arms[self.arm]
+        return self.settings.arms[self.arm]
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         self.returns.append(total(episode.rewards))
         self.worst = min(self.worst, self.returns[-1])
         self.best = max(self.best, self.returns[-1])
-        self.steps += len(episode)
-        if self.steps < self.rollout_steps:
-            return
+
+    def end_rollout(self) -> None:
+        """See `BetaController`."""
         if self.unpaid is not None:
             self.paid.append((self.unpaid, sum(self.returns) / len(self.returns)))
         self.unpaid = self.arm
         self.arm, self.pulls = self.choose(), self.pulls + 1
-        self.returns, self.steps = [], 0
+        self.returns = []
 
     def choose(self) -> int:
         """The next arm."""
-        arms = len(self.config.arms)
+        arms = len(self.settings.arms)
         if self.pulls < arms:
             return self.pulls
-        if self.generator.random() < self.config.epsilon:
+        if self.generator.random() < self.settings.epsilon:
             return int(self.generator.integers(arms))
         return int(np.argmax([self.score(arm) for arm in range(arms)]))
 
@@ -97,4 +100,4 @@ class SlidingWindowBandit(Stateful, BetaController):
             return -math.inf if arm == self.unpaid else math.inf
         span = self.best - self.worst
         mean = (sum(found) / len(found) - self.worst) / span if span > 0 else 0.0
-        return mean + self.config.exploration * math.sqrt(1 / len(found))
+        return mean + self.settings.exploration * math.sqrt(1 / len(found))

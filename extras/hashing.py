@@ -2,16 +2,25 @@
 
 import math
 from collections import Counter
+from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from pydantic import Field
 
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
-from mace_rl.config.bonus import HashCountsBonus
+from mace_rl.config.section import Count, Section, check
 from mace_rl.environments.rollout import Episode
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.state import Stateful
+
+
+class Settings(Section):
+    """The arguments of `HashCounts`."""
+
+    bits: int = Field(default=16, ge=1, le=62)  # k; more tell more states apart
+    calibration_states: Count = 1000  # the first visited; states are hashed in their units
 
 
 class HashCounts(Stateful, IntrinsicReward):
@@ -24,24 +33,20 @@ class HashCounts(Stateful, IntrinsicReward):
     the angle would otherwise be that of the dimension with the largest numbers. While these are
     collected, all visits are counted anew after each episode; then φ stays. Discrete states are
     one-hot and stay as they are.
+
+    Raises `ConfigError` for arguments that are not as `Settings` has them.
     """
 
     STATE = ("matrix", "normaliser", "early", "counts")
 
     largest = 1.0
 
-    def __init__(
-        self,
-        config: HashCountsBonus,
-        observation_space: Box | Discrete,
-        observation_size: int,
-        generator: np.random.Generator,
-    ) -> None:
-        self.config = config
-        self.matrix = generator.standard_normal((config.bits, observation_size))  # A
-        self.normaliser = RunningNormaliser(observation_size)
-        self.discrete = isinstance(observation_space, Discrete)
-        self.early = np.empty((0, observation_size), np.float32)  # what g was calibrated on
+    def __init__(self, spaces: Spaces, generator: np.random.Generator, **arguments: Any) -> None:
+        self.settings, size = check(Settings, arguments, "arguments"), spaces.observation_size
+        self.matrix = generator.standard_normal((self.settings.bits, size))  # A
+        self.normaliser = RunningNormaliser(size)
+        self.discrete = spaces.discrete_observations
+        self.early = np.empty((0, size), np.float32)  # what g was calibrated on
         self.counts: Counter[int] = Counter()
 
     def codes(self, states: np.ndarray) -> list[int]:
@@ -60,7 +65,7 @@ class HashCounts(Stateful, IntrinsicReward):
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
         """See `IntrinsicReward`; the returns do not matter."""
         states = episode.observations[1:]
-        if not self.discrete and len(self.early) < self.config.calibration_states:
+        if not self.discrete and len(self.early) < self.settings.calibration_states:
             self.normaliser.update(states)
             self.early = states = np.concatenate([self.early, states])
             self.counts.clear()
