@@ -234,7 +234,6 @@ MISTAKES = [  # one text for another, and what is said of it
     ("          robust: *above\n", "", ["C7.parts", "'robust'] as the first"]),
     ("    C2:", "    Q1:", ["questions.claims.Q1", "twice"]),
     ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
-    ("table1: {environment: Acro", "table1: {environment: Kart", ["C1.table1", "'Kartbot-v1'"]),
     ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
     ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
     ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),

@@ -19,9 +19,10 @@ from packaging.requirements import Requirement
 from shared import call
 
 import mace_rl
-from mace_rl import compiling, load_agent, settings, train
+from mace_rl import load_agent, settings, train
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
+from mace_rl.numerics import compiling
 from mace_rl.refusal import Refusal
 from mace_rl.runs.records import read_episodes
 

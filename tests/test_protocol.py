@@ -45,7 +45,7 @@ def test_claims_are_measured_as_the_page_says(name: str) -> None:
 
 def test_questions_have_the_parts_that_the_page_has() -> None:
     count = {
-        name: sum(len(part.each(None, QUESTIONS.table1)) for part in claim.parts[ROBUST])
+        name: sum(len(part.each(QUESTIONS.table1)) for part in claim.parts[ROBUST])
         for name, claim in ASKED.claims.items()
     }
     # By its words: five tasks; three; three times five others; four; one and one.

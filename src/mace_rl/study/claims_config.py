@@ -5,7 +5,7 @@ all of it is called. `read_claims` checks the file against the study that names 
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -57,6 +57,12 @@ class Table1Config(Section):
         numbers = self.values.get(environment, {}).get(variant)
         return numbers[self.metrics.index(metric)] if numbers and metric in self.metrics else None
 
+    def values_of(self, environments: Sequence[str], reading: str) -> dict[str, float]:
+        """By variant what the paper has of this reading's metric; nothing of several together."""
+        kinds = [place for place, kind in enumerate(self.metrics) if reading.startswith(kind)]
+        rows = self.values.get(environments[0], {}) if len(environments) == 1 else {}
+        return {name: rows[name][kinds[0]] for name in self.variants if kinds and rows}
+
     def is_within(self, environments: Iterable[str], variants: Iterable[str]) -> bool:
         """Whether a study of these has all that the table has."""
         return set(self.values) <= set(environments) and set(self.variants) <= set(variants)
@@ -67,13 +73,6 @@ class Table2Config(Section):
 
     rows: dict[str, str] = Field(default={})  # what they are called there
     others: dict[str, str] = Field(default={})  # what the paper leaves open
-
-
-class PlaceConfig(Section):
-    """A column of the paper's Table 1."""
-
-    environment: str
-    metric: str
 
 
 class PartsConfig(Section):
@@ -91,36 +90,28 @@ class PartsConfig(Section):
             raise ValueError(f"over has the variant itself, {self.variant!r}")
         return self
 
-    def each(self, place: PlaceConfig | None, table1: Table1Config) -> list[Part]:
-        """The parts: environment by environment, in each the variants that it is over.
-
-        place: in the paper's Table 1, where that says the same.
-        """
+    def each(self, table1: Table1Config) -> list[Part]:
+        """The parts: environment by environment, in each the variants that it is over."""
         groups = [self.environments] if self.together else [[env] for env in self.environments]
         others: list[str | None] = [*self.over] or [None]
-        return [self._part(group, other, place, table1) for group in groups for other in others]
+        own = self.metric, self.variant
+        return [
+            Part(tuple(group), *own, other, self._in_paper(group, other, table1))
+            for group in groups
+            for other in others
+        ]
 
-    def _part(
-        self, group: list[str], other: str | None, place: PlaceConfig | None, table1: Table1Config
-    ) -> Part:
-        in_paper = math.nan
-        if (
-            place
-            and other
-            and group == [place.environment]
-            and self.metric.startswith(place.metric)
-        ):
-            both = self.variant, other
-            mine, theirs = (table1.value(place.environment, name, place.metric) for name in both)
-            in_paper = math.nan if mine is None or theirs is None else float(mine - theirs)
-        return Part(tuple(group), self.metric, self.variant, other, in_paper)
+    def _in_paper(self, group: list[str], other: str | None, table1: Table1Config) -> float:
+        values = table1.values_of(group, self.metric)
+        if self.variant in values and other in values:
+            return float(values[self.variant] - values[other])
+        return math.nan
 
 
 class ClaimConfig(Section):
     """A claim or a question, and its parts, by one or several of `ways`."""
 
     statement: str
-    table1: PlaceConfig | None = None  # where the paper's Table 1 says so
     parts: Annotated[
         dict[str, Annotated[list[PartsConfig], Field(min_length=1)]], Field(min_length=1)
     ]
@@ -258,7 +249,7 @@ def _check_form(claims: ClaimsConfig) -> None:
                 )
     for title, family in claims.families.items():
         for name, claim in family.claims.items():
-            key, place = f"families.{title}.claims.{name}", claim.table1
+            key = f"families.{title}.claims.{name}"
             if name in seen:
                 raise ConfigError(f"{key} is there twice, but each claim should have its own name")
             seen.add(name)
@@ -267,6 +258,3 @@ def _check_form(claims: ClaimsConfig) -> None:
                     f"{key}.parts has {list(claim.parts)}, but should have {family.ways} as the"
                     " first of its family"
                 )
-            if place:
-                check_known(place.environment, table1.values, f"{key}.table1", "table1.values")
-                check_known(place.metric, table1.metrics, f"{key}.table1", "table1.metrics")

@@ -58,9 +58,7 @@ def _answers(
     judged: dict[str, dict[str, Judgement]] = {name: {} for name in family.claims}
     for how in family.ways:
         parts = {
-            name: [
-                part for several in claim.parts[how] for part in several.each(claim.table1, table1)
-            ]
+            name: [part for several in claim.parts[how] for part in several.each(table1)]
             for name, claim in family.claims.items()
         }
         findings = iter(judge(list(chain.from_iterable(parts.values())), table, settings))
@@ -198,12 +196,13 @@ def _detectable(differences: Sequence[np.ndarray]) -> float:
 
 
 def _in_paper(claim: ClaimConfig, table1: Table1Config, settings: MetricsConfig) -> str:
-    """What the paper's own table says of a claim; empty where it says nothing."""
-    if claim.table1 is None:
+    """What the paper's own table says of a claim's first part; empty where it says nothing."""
+    part = next(iter(claim.parts.values()))[0].each(table1)[0]
+    values = table1.values_of(part.environments, part.metric)
+    if not values:
         return ""
-    rows, metric = table1.values[claim.table1.environment], claim.table1.metric
-    values = {name: rows[name][table1.metrics.index(metric)] for name in table1.variants}
     units = {one.name: one.unit for one in all_metrics(settings)}
-    best = (min if units[metric] == "episodes" else max)(values, key=values.__getitem__)
+    best = (min if units[part.metric] == "episodes" else max)(values, key=values.__getitem__)
+    metric = next(one for one in table1.metrics if part.metric.startswith(one))
     numbers = ", ".join(f"{table1.variants[name]} {value}" for name, value in values.items())
     return f"{metric}: {numbers}; the best is {table1.variants[best]}"

@@ -10,19 +10,19 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
+import pandas as pd
+import seaborn
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mace_rl.runs.records import RecordError, RunKey
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.measure.metrics import moving_average
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
-
-if TYPE_CHECKING:  # imported where they are used: planning the workflow does without
-    import pandas as pd
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
@@ -65,7 +65,7 @@ def quantity(figure: str, settings: MetricsConfig) -> Quantity:
     return Quantity("extrinsic_return", window, "moving_average", label)
 
 
-def seed_curves(frames: "Mapping[RunKey, pd.DataFrame]", shown: Quantity) -> "pd.DataFrame":
+def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.DataFrame:
     """The curve of every run: the moving average of the `shown` column.
 
     `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
@@ -74,8 +74,6 @@ def seed_curves(frames: "Mapping[RunKey, pd.DataFrame]", shown: Quantity) -> "pd
     be seen.
     Columns: env, variant, seed, episode and the average by its name.
     """
-    import pandas as pd
-
     columns = ["env", "variant", "seed", "episode", shown.name]
     variants = {
         variant
@@ -98,15 +96,13 @@ def seed_curves(frames: "Mapping[RunKey, pd.DataFrame]", shown: Quantity) -> "pd
 
 
 def mean_curves(
-    single_seeds: "pd.DataFrame", shown: Quantity, settings: MetricsConfig
-) -> "pd.DataFrame":
+    single_seeds: pd.DataFrame, shown: Quantity, settings: MetricsConfig
+) -> pd.DataFrame:
     """The mean over seeds of `seed_curves`, with its pointwise interval.
 
     Columns: env, variant, episode, mean, lower, upper (both NaN with one seed), n (seeds).
     Raises `RecordError` if the seeds of a variant have not the same episodes.
     """
-    import pandas as pd
-
     columns = ["env", "variant", "episode", "mean", "lower", "upper", "n"]
     curves = []
     for (environment, variant), runs in single_seeds.groupby(["env", "variant"], sort=False):
@@ -123,11 +119,11 @@ def mean_curves(
 
 
 def draw_figure(
-    curves: "pd.DataFrame",
-    single_seeds: "pd.DataFrame",
+    curves: pd.DataFrame,
+    single_seeds: pd.DataFrame,
     shown: Quantity,
     look: PlotStyle,
-) -> "Figure":
+) -> Figure:
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
     The mean over seeds is a line, its interval a band (from three seeds on), and the single seeds
@@ -179,13 +175,11 @@ def draw_figure(
 
 def grid(
     count: int, columns: int, x: str = "", y: str = "", height: float = PANEL_HEIGHT
-) -> "tuple[Figure, list[Axes]]":
+) -> tuple[Figure, list[Axes]]:
     """A figure of `count` panels, at most so many side by side, so many inches high each.
 
     `x` stands below those that have none below them, `y` once on the left.
     """
-    from matplotlib.figure import Figure
-
     columns = min(columns, count)
     rows = math.ceil(count / columns)
     figure = Figure(figsize=(WIDTH, rows * height + LEGEND_HEIGHT), layout="constrained")
@@ -198,7 +192,7 @@ def grid(
     return figure, panels[:count]
 
 
-def legend(figure: "Figure", explained: str) -> None:
+def legend(figure: Figure, explained: str) -> None:
     """One legend below all panels, with the explanation of dots, lines and bars as its title."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
@@ -215,7 +209,7 @@ def legend(figure: "Figure", explained: str) -> None:
         line.set_linewidth(2)
 
 
-def save_figure(figure: "Figure", path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure of this module as PDF (fonts embedded as TrueType) or as PNG.
 
     Without date and version, so that an equal figure gives an equal file.
@@ -227,7 +221,7 @@ def save_figure(figure: "Figure", path: str | Path) -> None:
         figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dict.fromkeys(fields))
 
 
-def figure_as_svg(figure: "Figure") -> str:
+def figure_as_svg(figure: Figure) -> str:
     """A figure of this module as an SVG file without background, its text as text.
 
     An equal figure gives an equal file here too.
@@ -242,9 +236,6 @@ def figure_as_svg(figure: "Figure") -> str:
 @contextmanager
 def style() -> Iterator[None]:
     """The settings to draw and to save with, none of them the user's: saving lays text out."""
-    import matplotlib
-    import seaborn
-
     fonts = {"font.family": "DejaVu Sans", "pdf.fonttype": 42}  # this font comes with matplotlib
     fonts |= {"svg.fonttype": "none", "svg.hashsalt": "mace_rl"}  # text as text; ids that stay
     fonts |= {"text.parse_math": False}  # a label may have a $
@@ -261,7 +252,7 @@ def style() -> Iterator[None]:
         yield
 
 
-def _is_early(curves: "pd.DataFrame", share: float) -> bool:
+def _is_early(curves: pd.DataFrame, share: float) -> bool:
     """Whether every mean is most of its way up in the first `share` of the episodes."""
     early = curves[curves["episode"] <= share * curves["episode"].max()]
     lowest = curves.groupby("variant")["mean"].min()
@@ -269,7 +260,7 @@ def _is_early(curves: "pd.DataFrame", share: float) -> bool:
     return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
 
 
-def _draw(axes: "Axes", curves: "pd.DataFrame", look: PlotStyle) -> None:
+def _draw(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
     """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
     drawn: list[np.ndarray] = []
     near = HIDDEN * np.ptp(curves["mean"])

@@ -5,10 +5,12 @@
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import seaborn
+from matplotlib.figure import Figure
 
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.aggregate import SCORED
@@ -20,9 +22,6 @@ from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
 from mace_rl.study.show.tables import SOLVED
-
-if TYPE_CHECKING:  # drawing is imported where it is used, as in curves
-    from matplotlib.figure import Figure
 
 FIXED_BETA, LEARNED, OTHER = "fixed", "learned", "other"
 # Of parts, and of the verdicts alike; from seaborn's palette that the colour-blind can tell apart.
@@ -53,7 +52,7 @@ def every_seed(source: Source) -> pd.DataFrame:
     return long.sort_index(kind="stable").reset_index(drop=True)  # run by run
 
 
-def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """A dot per run, a dash at the mean of a variant; a row of panels per environment."""
     jitter = pd.Series(np.random.default_rng(0).uniform(-0.3, 0.3, len(table)), table.index)
     places = {name: place for place, name in enumerate(table["variant"].unique())}
@@ -94,7 +93,7 @@ def constants(source: Source) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["env", "variant", "role", "mean", "low", "high", "seeds"])
 
 
-def draw_constants(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """The constants joined by a line, the learned β across them, the others on the right."""
     with style():
         names = "Constant β", "Mean return of training"
@@ -139,10 +138,8 @@ def solved(source: Source) -> pd.DataFrame:
     return counted["solved"].agg(solved="sum", seeds="size").reset_index()
 
 
-def draw_solved(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+def draw_solved(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """A cell per variant and environment: the darker, the more seeds solve it; in it how many."""
-    import seaborn
-
     table = table.assign(
         share=table["solved"] / table["seeds"],
         text=table["solved"].astype(str) + "/" + table["seeds"].astype(str),
@@ -204,7 +201,7 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     return ", ".join(words)
 
 
-def draw_forest(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """A line per part, a panel per way of measuring; a claim's verdict stands at its right."""
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
@@ -278,7 +275,7 @@ def _placed(
     return table.assign(place=pd.concat(placed)), blocks
 
 
-def draw_readings(table: pd.DataFrame, look: PlotStyle) -> "Figure":
+def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
     environments, lines = list(table["env"].unique()), in_order(table)
     variants = list(table["variant"].unique())
@@ -324,7 +321,7 @@ class Picture(NamedTuple):
     """What makes the data of a picture, what draws it, and whether there is anything to draw."""
 
     data: Callable[[Source], pd.DataFrame]
-    draw: Callable[[pd.DataFrame, PlotStyle], "Figure"]
+    draw: Callable[[pd.DataFrame, PlotStyle], Figure]
     fits: Callable[[Source], bool]
 
 
