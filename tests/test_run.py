@@ -311,6 +311,7 @@ def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypa
             os._exit(0)
         with pytest.raises(run.RunError), run.exclusive(tmp_path):
             pass
+    monkeypatch.setattr(run, "LOCK_SECONDS", 5.0)  # a worker takes a moment to close its copy
     with run.exclusive(tmp_path):
         assert os.waitpid(worker, os.WNOHANG) == (0, 0)  # it lives
     os.close(wake)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from mace_rl import sources
 from mace_rl.config.plugins import source_files
@@ -34,8 +34,8 @@ PACKAGES = (
 class RecordedConfig(BaseModel):
     """What every configuration in a run.json has; the rest may be of another version's."""
 
-    environment: str
-    variant: str
+    environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # cells of the table of `export`
+    variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
     seed: int
     episodes: int
 
