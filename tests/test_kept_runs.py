@@ -153,8 +153,11 @@ def tar_of(members: list[tuple[str, bytes, bytes]]) -> bytes:
     return lzma.compress(buffer.getvalue())
 
 
+OTHER = '{"episodes.csv": "of other episodes"}'
+
+
 def with_record(episodes: str, seconds: str = "1", text: str = "") -> dict[str, bytes]:
-    whole = f'{{"seconds": {seconds}, "config": {{"episodes": {episodes}}}}}'
+    whole = f'{{"seconds": {seconds}, "config": {{"episodes": {episodes}}}, "outputs": {OTHER}}}'
     return {"seed1/run.json": (text or whole).encode()}
 
 
@@ -168,7 +171,7 @@ HOSTILE = {  # members that are added or replaced, by what is said of them
     "has 0 episodes": with_record("0"),
     "has True episodes": with_record("true"),
     "has 1000000000000 episodes, of which there are 30": with_record("1000000000000"),
-    "its runs have 29 episodes together": with_record("29"),
+    "run.json has other episodes": with_record("30"),
     "list indices": with_record("", text="[]"),
     "'config'": with_record("", text="{}"),
     "has None seconds": with_record("30", "null"),
@@ -197,6 +200,12 @@ def test_what_was_never_packed_is_refused_in_one_line(
     if isinstance(damage, dict):
         damage = tar_of([(*one, b"0") for one in (members | damage).items()])
     path.write_bytes(damage)
+    for name in ("..", ".", ""):  # which would be other folders
+        odd = tmp_path / "odd" / "A-v1" / f"{name}.tar.xz"
+        odd.parent.mkdir(parents=True, exist_ok=True)
+        odd.write_bytes(path.read_bytes())
+        with pytest.raises(ValueError, match="its name is not"):
+            kept_runs.read(odd)
     before = content(tmp_path)
     for sample in ([], ["--sample", "1"]):
         words = ["kept_runs", "unpack", str(path.parents[1]), str(tmp_path / "goal"), *sample]

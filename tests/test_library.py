@@ -114,13 +114,19 @@ def test_a_mistake_gets_one_line(message):
     assert "\n" not in str(caught.value)
 
 
+class Text(str):
+    __slots__ = ()
+
+
 def test_arguments_are_what_json_gives_back(monkeypatch, tmp_path):
     """So that what is played later is what was trained, and the same call finds its run again."""
-    given = {"map_name": None, "desc": (np.str_("SF"), "FG"), "is_slippery": np.bool_(False)}
+    map_ = Text("SF")  # as an enum's members are texts or numbers
+    given = {"map_name": None, "desc": (map_, "FG"), "is_slippery": np.bool_(False)}
     run = settings("FrozenLake-v1", "ppo", episodes=2, environment_arguments=given)
     plain = {"map_name": None, "desc": ["SF", "FG"], "is_slippery": False}
     assert run.environment_arguments == plain
     assert [*map(type, run.environment_arguments.values())] == [type(None), list, bool]
+    assert type(run.environment_arguments["desc"][0]) is str
     for _ in range(2):
         train(run, folder=tmp_path)
     found = json.loads((tmp_path / "run.json").read_text())["config"]

@@ -291,6 +291,15 @@ def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
     )
 
 
+def test_what_a_program_has_set_in_pytorch_changes_nothing(run_config, tmp_path):
+    config = run_config("CartPole-v1", "ppo", 0, episodes=2, engine="torch")
+    run.run(config, tmp_path / "plain")
+    with torch.inference_mode(), torch.autocast("cpu"):
+        run.run(config, tmp_path / "set")
+    one, other = ((tmp_path / name / "agent.pt").read_bytes() for name in ("plain", "set"))
+    assert one == other
+
+
 def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)  # which a fork may take
     asleep, wake = os.pipe()
@@ -475,6 +484,16 @@ class Draws(gymnasium.Env):
         return np.full(1, reward, np.float32), reward, False, False, {}
 
 
+class Offers(gymnasium.Wrapper):
+    """Has what its environment remembers beside its generator."""
+
+    def state_dict(self) -> dict:
+        return {"resets": self.env.resets}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.env.resets = state["resets"]
+
+
 def seed_all(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
@@ -484,7 +503,7 @@ def seed_all(seed: int) -> None:
 @pytest.mark.parametrize(
     ("kind", "saved"),
     [
-        *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered")),
+        *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered", "wrapper")),
         *((kind, False) for kind in ("own", "kept", "counter")),
         *((name, True) for name in ("FrozenLake-v1", "Pendulum-v1", "AntBulletEnv-v0")),
         ("HumanoidFlagrunHarderBulletEnv-v0", False),
@@ -494,7 +513,8 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
     run_config, register, tmp_path, kill, checkpoint_every, caplog, kind, saved
 ):
     """By a replay of the last episodes, which changes nothing."""
-    name = kind if "-v" in kind else register("Draws-v0", Draws, 5, kind=kind)
+    draws = (lambda **given: Offers(Draws(**given))) if kind == "wrapper" else Draws
+    name = kind if "-v" in kind else register("Draws-v0", draws, 5, kind=kind)
     config = run_config(name, "ppo", 0, episodes=30, max_episode_steps=60 if "-v" in kind else 5)
     checkpoint_every(1)
     for folder in ("killed", "whole"):

@@ -7,6 +7,7 @@ import shutil
 import sys
 import zipfile
 
+import numpy as np
 import pytest
 import torch
 from shared import LAYER_NORM, call
@@ -100,6 +101,27 @@ def test_names_of_this_package_and_other_texts_are_no_code_from_outside():
     assert [*code_outside({"a": "mace_rl_x:Y", "b": [" os:X"], "c": ":"})] == ["c", "b", "a"]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
+        (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
+        (r"\A.*\Z", '["config", "versions", "sources", "machine", "outputs"]', "not readable"),
+        (r'"outputs": \{.*\}', '"outputs": {}', "the key 'agent.pt' is missing"),
+        (r'"machine": \{.*?\}', '"machine": 3', "the key 'machine' is missing or"),
+        ('"mace_fixed"', '"a,b"', "variant is 'a,b', but"),
+        ('"CartPole-v1"', '"CartPole-v1,0"', "environment is 'CartPole-v1,0', but"),
+    ],
+)
+def test_what_no_run_wrote_is_one_line(kept, monkeypatch, old, new, message):
+    run = kept()
+    text = (run / files.RECORD).read_text()
+    (run / files.RECORD).write_text(re.sub(old, new, text, count=1, flags=re.DOTALL))
+    for words in (f"evaluate {run}", f"watch {run}", "verify .", "export . --out a.csv"):
+        code, said = call(monkeypatch, *words.split())
+        assert code == 1 and re.search(rf"^[^\n]*run\.json: {message}[^\n]*$", said), said
+
+
 def compressed():
     """A zip file that unpacks to more than it is."""
     data = io.BytesIO()
@@ -109,7 +131,11 @@ def compressed():
 
 
 BIAS = "policy.network.2.bias"
+STD = "policy.std"
 DAMAGE = {
+    f"{BIAS} is meta": lambda s: archive(s | {BIAS: s[BIAS].to("meta")}),
+    f"{STD} has NaN or Inf in it, or is not": lambda s: archive(s | {STD: s[STD] * 0}),
+    "not a readable archive: Weights only load failed$": lambda _: archive({"a": np.zeros(1)}),
     f"{BIAS} is .*shape .3,.*should be .*shape .64,": lambda s: archive(s | {BIAS: torch.ones(3)}),
     f"{BIAS} has NaN or Inf": lambda s: archive(s | {BIAS: s[BIAS] * torch.nan}),
     f"{BIAS} is .*float64": lambda s: archive(s | {BIAS: s[BIAS].double()}),

@@ -271,9 +271,7 @@ def main() -> None:
     except (Refusal, OSError, MemoryError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except ModuleNotFoundError as error:
-        if (
-            arguments.command == "train"
-        ):  # in code of the user's own, whose place the traceback tells
+        if arguments.command == "train":  # in the user's own code, whose place the traceback tells
             raise
         extra = "tensorboard" if arguments.command == "tensorboard" else "study"
         sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")

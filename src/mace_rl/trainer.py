@@ -32,7 +32,7 @@ from mace_rl.experience import (
 )
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
-from mace_rl.numerics.finite import TOO_LARGE, require_finite, require_within
+from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
 from mace_rl.refusal import Refusal
 from mace_rl.results.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
@@ -115,10 +115,10 @@ class Trainer:
         beta, bonus, intrinsic_scale = 0.0, None, 1.0
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
-            beta = self.controller.beta
+            beta = float(numbers("β", self.controller.beta, ()))
             require_within("β", beta)
             bonus = self.curiosity.bonus(episode)
-            reward = bonus.reward
+            reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
             largest = min(self.curiosity.largest, TOO_LARGE)
             require_within("the curiosity bonus", reward, 1e-6, largest)
             reward = np.maximum(reward, 0.0)

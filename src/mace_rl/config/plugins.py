@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, short
 
 
 def code_outside(settings: Any) -> dict[str, str]:
@@ -71,9 +71,12 @@ def make(
     except TypeError as error:
         raise ConfigError(f"{key} has {reference!r} with {arguments}: {error}") from None
     try:
-        return factory(*given, **arguments)
+        made = factory(*given, **arguments)
     except ConfigError as error:
         raise ConfigError(f"{key} has {reference!r}: {error}") from None
+    if not isinstance(made, kind):
+        raise ConfigError(f"{key} has {reference!r}, which returned {short(made)}")
+    return made
 
 
 def import_module(reference: str, key: str) -> ModuleType:
@@ -84,8 +87,8 @@ def import_module(reference: str, key: str) -> ModuleType:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError(f"{module!r} is no module's name")
         return importlib.import_module(module)
-    except ImportError as error:
-        reason = " ".join(str(error).split())
+    except (ImportError, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
 
 

@@ -28,8 +28,8 @@ class RunConfig(Section):
     others, so that a change of what a variant does not use leaves its runs alone.
     """
 
-    environment: str
-    variant: str
+    environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # for files: `Study` is stricter
+    variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
     seed: int = Field(ge=0, lt=2**32)
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit

@@ -63,7 +63,7 @@ def estimate(
 
 def markdown(frame: pd.DataFrame) -> str:
     """A table as Markdown."""
-    lines = [f"| {' | '.join(frame.columns)} |", "|---" * len(frame.columns) + "|"]
+    lines = [f"| {' | '.join(map(_markdown, frame.columns))} |", "|---" * len(frame.columns) + "|"]
     lines += [f"| {' | '.join(map(_markdown, row))} |" for row in frame.to_numpy()]
     return "\n".join(lines) + "\n"
 

@@ -108,8 +108,9 @@ class Player:
             if found != right:
                 raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
             bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
+            bad |= (state[name] <= 0) & (name in ("policy.std", "policy.clip"))
             if bad.any():
-                raise CheckpointError(f"{path}: {name} has NaN or Inf in it")
+                raise CheckpointError(f"{path}: {name} has NaN or Inf in it, or is not positive")
         self.agent.load_state_dict(state)
         policy, loaded = self.networks.policy, self.agent.policy
         policy.network.load_module_state(loaded.network.state_dict())
@@ -129,5 +130,5 @@ class Player:
 def _kind(entry: Any) -> str:
     """What an entry of a state is, without its values."""
     if isinstance(entry, Tensor):
-        return f"{entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
+        return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
     return "missing" if entry is None else f"a {type(entry).__name__}"

@@ -60,7 +60,8 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
                 raise ValueError("it is compressed")
         return dict(torch.load(io.BytesIO(data), weights_only=True))
     except Exception as error:  # torch reports damage by many types
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        # Of PyTorch's advice to trust it, with colours, not more than the first sentence.
+        reason = str(error).splitlines()[0].partition(". ")[0] if str(error) else repr(error)
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
 
 

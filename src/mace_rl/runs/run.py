@@ -238,11 +238,14 @@ def between_checkpoints() -> float:
 
 @contextmanager
 def left_alone() -> Iterator[None]:
-    """One thread for PyTorch, and nothing frozen for the collector, when this is over as before."""
+    """PyTorch on one thread as it begins, and nothing frozen for the collector; then as before."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+            yield
+    except SystemExit as error:
+        raise RunError(f"code of a plugin ended the program: {error!r}") from error
     finally:
         torch.set_num_threads(threads)
         gc.unfreeze()
