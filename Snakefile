@@ -13,7 +13,6 @@ configfile: f"{workflow.basedir}/config.yaml"
 
 include: "workflow/rules/study.smk"
 include: "workflow/rules/train.smk"
-include: "workflow/rules/metrics.smk"
 include: "workflow/rules/tables.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/claims.smk"
@@ -31,7 +30,6 @@ localrules:
     tables_page,
     figure,
     picture,
-    readings,
     page,
 
 
@@ -43,6 +41,5 @@ rule all:
         rules.table2.output,
         rules.tables_page.output,
         expand(rules.figure.output, number=[1, 2]),
-        expand(rules.picture.output, picture=PICTURES),
-        rules.readings.output,
-        CLAIMS,
+        expand(rules.picture.output, picture=[*PICTURES, *READ]),
+        rules.claims.output if LEDGER else [],

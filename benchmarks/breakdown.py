@@ -12,10 +12,16 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, Scale, in_fresh_process
+from benchmarks.measuring import (
+    CARTPOLE,
+    ENVIRONMENTS,
+    FIRST_SEED,
+    HOPPER,
+    Scale,
+    in_fresh_process,
+)
 from benchmarks.speed import OURS, our_config, warm_up
 from mace_rl.environments import classic_control
-from mace_rl.results.paper import CARTPOLE, HOPPER
 
 # Each part with its functions as they hang on a Trainer. What no function here accounts for is
 # bookkeeping.

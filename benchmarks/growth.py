@@ -11,9 +11,15 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from benchmarks.measuring import FIRST_SEED, Scale, in_fresh_process, memory_mb
+from benchmarks.measuring import (
+    ACROBOT,
+    FIRST_SEED,
+    HOPPER,
+    Scale,
+    in_fresh_process,
+    memory_mb,
+)
 from benchmarks.speed import our_config
-from mace_rl.results.paper import ACROBOT, HOPPER
 
 # Shaped like Acrobot and like Hopper, with their settings and time limits.
 WALKS = {"AcrobotLikeWalk-v0": ACROBOT, "HopperLikeWalk-v0": HOPPER}

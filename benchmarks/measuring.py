@@ -14,14 +14,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from mace_rl.results.paper import ACROBOT, CARTPOLE, HOPPER
-
 ROOT = Path(__file__).resolve().parents[1]
 FILE = "measurements.csv"
 COLUMNS = ("section", "env", "contestant", "repeat", "part", "steps", "seconds", "cpu_seconds")
 COLUMNS += ("memory_mb", "note", "machine")
 
-ENVIRONMENTS = (CARTPOLE, ACROBOT, HOPPER)
+ENVIRONMENTS = CARTPOLE, ACROBOT, HOPPER = "CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"
+VARIANTS = ("ppo", "mace_fixed", "mace_full")
 FIRST_SEED = 1000  # of the measurements; the study reports others
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 PACKAGES = "torch numpy numba gymnasium pybullet stable-baselines3"

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import speed
-from benchmarks.measuring import FIRST_SEED, ROOT, THREADS, Scale
+from benchmarks.measuring import ACROBOT, CARTPOLE, FIRST_SEED, ROOT, THREADS, Scale
 from benchmarks.speed import OURS, REFERENCE, our_config
-from mace_rl.results.paper import ACROBOT, CARTPOLE
 
 ENVIRONMENTS = (CARTPOLE, ACROBOT)
 # Its contestants: environments side by side, steps of each in a rollout, minibatches.

@@ -12,8 +12,15 @@ import gymnasium
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
-from benchmarks.measuring import ENVIRONMENTS, FIRST_SEED, ROOT, Scale, in_fresh_process, memory_mb
-from mace_rl.results.paper import HOPPER
+from benchmarks.measuring import (
+    ENVIRONMENTS,
+    FIRST_SEED,
+    HOPPER,
+    ROOT,
+    Scale,
+    in_fresh_process,
+    memory_mb,
+)
 
 if TYPE_CHECKING:  # imported where it is used: the others' memory should not hold it
     from mace_rl.config.run import RunConfig
@@ -120,7 +127,7 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
 
 def our_config(contestant: str, environment: str, seed: int) -> "RunConfig":
     """The study's settings of one of `OURS`, but without an end."""
-    from mace_rl.config.study import read_study
+    from mace_rl.study.config import read_study
 
     config = read_study([ROOT / "config.yaml"]).run_config(environment, OURS[contestant], seed)
     whole = {"rollout_steps": 2048, "minibatch_size": None} if contestant == "ppo_2048" else {}

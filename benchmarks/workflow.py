@@ -15,8 +15,7 @@ from typing import Any
 
 import yaml
 
-from benchmarks.measuring import ENVIRONMENTS, ROOT, Scale
-from mace_rl.results.paper import VARIANTS
+from benchmarks.measuring import ENVIRONMENTS, ROOT, VARIANTS, Scale
 
 CORES = 2
 BEFORE, AFTER = "before the first training: imports, planning", "after the last: tables, figures"

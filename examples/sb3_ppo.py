@@ -15,7 +15,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from mace_rl.results.statistics import mean_interval, paired_comparison
+from mace_rl.study.compare.statistics import mean_interval, paired_comparison
 from mace_rl.wrappers import CuriosityReward
 
 MEASURES = ("all episodes", "last tenth")

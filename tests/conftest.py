@@ -22,8 +22,8 @@ import pytest
 from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
-from mace_rl.config.study import Study, read_study
 from mace_rl.environments import registered
+from mace_rl.study.config import Study, read_study
 
 if TYPE_CHECKING:
     from mace_rl.agent.ppo import PPO

@@ -2,17 +2,19 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import scipy.stats
 
-from mace_rl.config.results import MetricsConfig
 from mace_rl.config.section import check
-from mace_rl.results.aggregate import SCORED
-from mace_rl.results.metrics import Metric, metrics_columns
-from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
-from mace_rl.results.protocol import AREA, CORRELATION, QUESTIONS, ROBUST
+from mace_rl.study.claims_config import parts_of, read_claims
+from mace_rl.study.compare.aggregate import SCORED
+from mace_rl.study.compare.ledger import Finding
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import CORRELATION, Metric, metrics_columns
+from mace_rl.study.metrics_config import MetricsConfig
 
 SETTINGS = {
     "final_fraction": 0.1,
@@ -29,6 +31,16 @@ SETTINGS = {
     "solved_return": {"CartPole-v1": 475.0, "Acrobot-v1": -100.0},
 }
 CONFIG = check(MetricsConfig, SETTINGS, "test")
+
+ROOT = Path(__file__).parents[1]
+STUDY = read_study([ROOT / "config.yaml"])
+CLAIMS = read_claims(STUDY, ROOT / STUDY.claims)
+PAPERS, QUESTIONS = (
+    CLAIMS.model_copy(update={"families": {title: family}})
+    for title, family in CLAIMS.families.items()
+)
+LITERAL, ROBUST = CLAIMS.ways
+ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
 LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
@@ -69,10 +81,10 @@ def table_for_tables(
     return pd.DataFrame(rows)
 
 
-def digits_of(part: dict) -> int:
+def digits_of(part: Finding) -> int:
     """With how many a part is printed: of a return so many that the margin has two figures."""
-    decimals = f"{part['worth_mentioning']:.1e}".partition("e")[2]
-    return {"episodes": 0, "return": max(1, 1 - int(decimals))}.get(part["unit"], 3)
+    decimals = f"{part.worth_mentioning:.1e}".partition("e")[2]
+    return {"episodes": 0, "return": max(1, 1 - int(decimals))}.get(part.unit, 3)
 
 
 def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> pd.DataFrame:
@@ -106,13 +118,13 @@ def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> p
 def table_for_questions(seeds: int, **better: float) -> pd.DataFrame:
     """metrics.csv with mean returns of all that our questions need; some variants are better."""
     draws = np.random.default_rng(4)
-    parts = [part for claim in QUESTIONS for part in claim.parts[ROBUST]]
+    parts = [part for _, part in parts_of(*QUESTIONS.families.values())]
     environments = dict.fromkeys(env for part in parts for env in part.environments)
-    variants = dict.fromkeys(name for part in parts for name in (part.variant, part.baseline))
+    variants = dict.fromkeys(name for part in parts for name in (part.variant, *part.over))
     cells = itertools.product(environments, variants)
     rows = [
         {"env": env, "variant": variant, "seed": seed, "episodes": 2000}
-        | {AREA: draws.normal() + better.get(variant, 0)}
+        | {"area_under_curve": draws.normal() + better.get(variant, 0)}
         for env, variant in cells
         for seed in range(seeds)
     ]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import breakdown, purejaxrl
-from mace_rl.results.paper import CARTPOLE, HOPPER
+from benchmarks.measuring import CARTPOLE, HOPPER
 
 
 @pytest.mark.slow

@@ -13,10 +13,10 @@ from mace_rl.beta.controller import Effect
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.progress import FAST, IMPROVEMENT, SLOW, Progress
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import read_study
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
+from mace_rl.study.config import read_study
 
 ROOT = Path(__file__).parents[1]
 SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}

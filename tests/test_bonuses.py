@@ -10,9 +10,9 @@ from shared import finish
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import read_study
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
+from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"

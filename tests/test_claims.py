@@ -7,14 +7,28 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import EPISODES, table_for_claims, table_for_questions
+from invented import (
+    CLAIMS,
+    EPISODES,
+    LITERAL,
+    PAPERS,
+    QUESTIONS,
+    ROBUST,
+    ROOT,
+    STUDY,
+    table_for_claims,
+    table_for_questions,
+)
 
-from mace_rl.config.study import Study, read_study
-from mace_rl.results import claims
-from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, ROBUST, WAYS, asked
-from mace_rl.results.records import RecordError
+from mace_rl.config.section import ConfigError
+from mace_rl.runs.records import RecordError
+from mace_rl.study.claims_config import parts_of, read_claims
+from mace_rl.study.compare import verdicts
+from mace_rl.study.compare.ledger import Finding, read_ledger, to_json
+from mace_rl.study.config import Study, read_study
+from mace_rl.study.measure.metrics import CORRELATION
 
-PAPERS = FAMILIES[:1]
+QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
 PLAIN = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
@@ -22,14 +36,14 @@ FIXED = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}
 WORST = {"ppo": 0.2, "mace_fixed": 0.2, "mace_full": -0.1}
 VAST = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.6}
 SLIGHT = {"ppo": 0.0, "mace_fixed": 0.01, "mace_full": 0.03}
-BUT_C6 = [claim.name for claim in CLAIMS if claim.name != "C6"]  # which says that fixed is first
+BUT_C6 = [f"C{number}" for number in range(1, 11) if number != 6]  # which says that fixed is first
 OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
 
 
-def parts_of(frame: pd.DataFrame, study: Study, claim: str, how: str = ROBUST) -> list[dict]:
-    found = claims.ledger(frame, study.metrics, PAPERS)
-    (record,) = (one for one in found if one["claim"] == claim)
-    return record[how]["parts"]
+def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
+    answers = verdicts.ledger(frame, study.metrics, PAPERS)
+    (answer,) = (one for one in answers if one.claim == claim)
+    return answer.ways[ROBUST].parts
 
 
 @pytest.mark.parametrize(
@@ -52,8 +66,8 @@ def test_verdicts_where_the_truth_is_known(
     study: Study, seeds: int, advantage: dict, noise: float, which: list[str], expected: str
 ) -> None:
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    records = claims.ledger(table_for_claims(seeds, advantage, noise), settings, PAPERS)
-    found = {record["claim"]: {record[how]["verdict"] for how in WAYS} for record in records}
+    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), settings, PAPERS)
+    found = {one.claim: {judged.verdict for judged in one.ways.values()} for one in answers}
     assert {name: found[name] for name in which} == {name: {expected} for name in which}
 
 
@@ -73,13 +87,13 @@ def test_a_part_comes_out_by_the_written_rule(
     seeds: int, difference: float, p_holm: float, p_equivalent_holm: float, expected: str
 ) -> None:
     """The p values that are not corrected say nothing."""
-    finding = claims.Finding(
+    finding = Finding(
         *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", seeds, difference),
         *(-99.0, 99.0, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001),
         *(p_holm, p_equivalent_holm),
     )
     assert (finding.p_value, finding.p_equivalent) == (0.0001, 0.0001)
-    assert claims.outcome(finding) == expected
+    assert verdicts.outcome(finding) == expected
 
 
 def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
@@ -94,42 +108,27 @@ def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
             expected = "absent"
         else:
             expected = "open"
-        assert claims.verdict(found) == expected
-
-
-def test_what_a_study_can_answer() -> None:
-    named = [
-        {name for claim in family.claims for parts in claim.parts.values() for part in parts
-         for name in (*part.environments, part.variant, part.baseline)} - {None}
-        for family in FAMILIES
-    ]  # fmt: skip
-    for family, names in zip(FAMILIES, named, strict=True):
-        assert asked(names, names) == [family]
-        for name in names:
-            assert asked(names - {name}, names - {name}) == []
-    assert asked(named[0] | named[1], named[0] | named[1]) == list(FAMILIES)
+        assert verdicts.verdict(found) == expected
 
 
 def test_all_parts_are_corrected_together_and_have_the_margin_of_what_they_measure(
     study: Study,
 ) -> None:
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    records = claims.ledger(table_for_claims(12, SMALL, noise=0.1), settings, PAPERS)
+    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), settings, PAPERS)
     for how in (LITERAL, ROBUST):
-        parts = [part for record in records for part in record[how]["parts"]]
+        parts = [part for answer in answers for part in answer.ways[how].parts]
         # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
         count = len(parts)
         assert count == 24
         for given, corrected in (("p_value", "p_holm"), ("p_equivalent", "p_equivalent_holm")):
-            p = sorted(part[given] for part in parts)
+            p = sorted(getattr(part, given) for part in parts)
             holm = [max(min(1, p[i] * (count - i)) for i in range(k + 1)) for k in range(count)]
             expected = dict(zip(p, holm, strict=True))
             for part in parts:
-                assert part[corrected] == pytest.approx(expected[part[given]])
-        assert len({round(part["p_holm"], 9) for part in parts}) > 5  # they are not all 1
-        margins = {
-            (part["metric"], *part["environments"]): part["worth_mentioning"] for part in parts
-        }
+                assert getattr(part, corrected) == pytest.approx(expected[getattr(part, given)])
+        assert len({round(part.p_holm, 9) for part in parts}) > 5  # they are not all 1
+        margins = {(part.metric, *part.environments): part.worth_mentioning for part in parts}
         for environment in EPISODES:
             assert margins[CORRELATION, environment] == 0.05
             reference = study.metrics.reference_return[environment]
@@ -140,21 +139,21 @@ def test_all_parts_are_corrected_together_and_have_the_margin_of_what_they_measu
 
 def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    part = parts_of(frame, study, "C1")[0]
-    assert (part["variant"], part["baseline"]) == ("mace_full", "ppo")
+    part = found_of(frame, study, "C1")[0]
+    assert (part.variant, part.baseline) == ("mace_full", "ppo")
     runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])
     times = runs["sample_efficiency_common"]
     gain = times["ppo"] - times["mace_full"]  # fewer episodes are the improvement
-    assert part["difference"] == pytest.approx(gain.mean())
-    assert part["worth_mentioning"] == 100
-    assert part["in_paper"] == 186 - 249  # of its Table 1: the learned β is the later one
+    assert part.difference == pytest.approx(gain.mean())
+    assert part.worth_mentioning == 100
+    assert part.in_paper == 186 - 249  # of its Table 1: the learned β is the later one
     t = scipy.stats.t(11)
-    assert part["detectable"] == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * gain.sem())
+    assert part.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * gain.sem())
     u = scipy.stats.mannwhitneyu(times["ppo"], times["mace_full"]).statistic
-    assert part["probability"] == pytest.approx(u / 144)
+    assert part.probability == pytest.approx(u / 144)
     # Verdicts are of 95 % intervals, whatever those of the tables have.
     wide = study.metrics.model_copy(update={"confidence": 0.5})
-    assert claims.ledger(frame, wide, PAPERS)[0][ROBUST]["parts"][0] == part
+    assert verdicts.ledger(frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
 
 
 def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
@@ -162,22 +161,23 @@ def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     own = (frame["env"] == "CartPole-v1") & (frame["variant"] == "ppo") & (frame["seed"] == 5)
     with pytest.raises(RecordError, match=r"CartPole-v1, ppo, seed 5: there is no"):
-        claims.ledger(frame[~own], study.metrics, PAPERS)
+        verdicts.ledger(frame[~own], study.metrics, PAPERS)
 
 
 def test_one_seed_has_estimates_but_no_tests(study: Study) -> None:
     frame = table_for_claims(1, PLAIN, noise=0.02)
-    part = parts_of(frame, study, "C1")[0]
+    part = found_of(frame, study, "C1")[0]
     runs = frame[frame["env"] == "Acrobot-v1"].set_index("variant")["sample_efficiency_common"]
-    assert part["difference"] == runs["ppo"] - runs["mace_full"]
-    assert {part[name] for name in ("low", "high", "p_value", "p_holm", "detectable")} == {None}
+    assert part.difference == runs["ppo"] - runs["mace_full"]
+    untold = "low", "high", "p_value", "p_holm", "detectable"
+    assert np.isnan([getattr(part, name) for name in untold]).all()
 
 
 def test_a_part_without_a_test_counts_where_all_are_corrected(study: Study) -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     one_seed = frame[(frame["env"] != "HopperBulletEnv-v0") | (frame["seed"] == 0)]
     # By 2 of 2¹² sign patterns, as in most others; of 24 only C8's two parts have smaller p values.
-    found = [part["p_holm"] for part in parts_of(one_seed, study, "C1")]
+    found = [part.p_holm for part in found_of(one_seed, study, "C1")]
     assert found == pytest.approx([22 * 2 / 2**12] * 2)
 
 
@@ -187,27 +187,80 @@ def test_variants_of_different_budgets_are_compared_within_the_shorter(study: St
     for variant, budget in (("ppo", 4000), ("mace_full", 2000), ("mace_fixed", 500)):
         own = (frame["env"] == "CartPole-v1") & (frame["variant"] == variant)
         frame.loc[own, ["episodes", "sample_efficiency_common"]] = budget  # never reached
-    over_ppo, over_fixed = parts_of(frame, study, "C5")
-    assert (over_ppo["difference"], over_ppo["probability"]) == (0, 0.5)
-    assert (over_ppo["worth_mentioning"], over_fixed["worth_mentioning"]) == (100, 25)
+    over_ppo, over_fixed = found_of(frame, study, "C5")
+    assert (over_ppo.difference, over_ppo.probability) == (0, 0.5)
+    assert (over_ppo.worth_mentioning, over_fixed.worth_mentioning) == (100, 25)
 
 
 def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds() -> None:
     """Q7: three tasks, of which one has more seeds."""
-    root = Path(__file__).parents[1]
-    settings = read_study([root / "config.yaml", root / "config" / "questions.yaml"]).metrics
-    settings = settings.model_copy(update={"bootstrap_repetitions": 1000})
+    settings = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})
     frame = table_for_questions(30, mace_full=0.3)
     frame = frame[(frame["env"] == "BarrenRegion-v0") | (frame["seed"] < 12)]
-    found = claims.ledger(frame, settings, FAMILIES[1:])
-    (part,) = next(record for record in found if record["claim"] == "Q7")[ROBUST]["parts"]
+    found = verdicts.ledger(frame, settings, QUESTIONS)
+    (part,) = next(one for one in found if one.claim == "Q7").ways[ROBUST].parts
     areas = frame.set_index(["env", "variant", "seed"])["area_under_curve"].sort_index()
     expected = [
         (areas[env, "mace_full"] - areas[env, "mace_no_memory"]).mean()
         / (settings.reference_return[env] - settings.random_return[env])
         for env in ("BarrenRegion-v0", "NoisyMountainCar-v0", "NoisyDeepSea10-v0")
     ]
-    assert part["difference"] == pytest.approx(np.mean(expected))
-    assert (part["worth_mentioning"], part["seeds"]) == (0.05, 12)
-    assert [len(record[ROBUST]["parts"]) for record in found] == [5, 3, 5, 5, 5, 4, 1, 1]
-    assert all(LITERAL not in record for record in found)
+    assert part.difference == pytest.approx(np.mean(expected))
+    assert (part.worth_mentioning, part.seeds) == (0.05, 12)
+    assert [len(answer.ways[ROBUST].parts) for answer in found] == [5, 3, 5, 5, 5, 4, 1, 1]
+    assert all(list(answer.ways) == [ROBUST] for answer in found)
+
+
+def test_the_ledger_is_read_as_it_was_written(tmp_path: Path) -> None:
+    answers = verdicts.ledger(table_for_claims(1, PLAIN, 0.1), STUDY.metrics, PAPERS)  # with NaN
+    path = tmp_path / "claims.json"
+    path.write_text(to_json({"runs": 9}, answers), encoding="utf-8")
+    assert repr(read_ledger(path)) == repr(answers)
+
+
+# The file of what a paper says.
+
+MISTAKES = [  # one text for another, and what is said of it
+    ("variant: mace_full", "variant: mace_ful", ["C1.parts", "'mace_ful'", "'mace_full'"]),
+    ("metric: final_return", "metric: final_retrun", ["C6.parts", "'final_retrun'", "'final_re"]),
+    ("[Acrobot-v1, HopperB", "[Acrobat-v1, HopperB", ["C7.parts", "'Acrobat-v1'", "'Acrobot-v1'"]),
+    (
+        "- &full {",
+        "- &full {tugether: true, ",
+        ['tugether" (value True)', "C1.parts", "'together'"],
+    ),
+    ("over: [ppo, mace_fixed]", "over: [mace_full]", ["C1.parts", "the variant itself"]),
+    ("robust: *above", "rubust: *above", ["C7.parts", "'rubust'", "'robust'"]),
+    ("          robust: *above\n", "", ["C7.parts", "'robust'] as the first"]),
+    ("    C2:", "    Q1:", ["questions.claims.Q1", "twice"]),
+    ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
+    ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
+    ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
+    ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "said"), MISTAKES)
+def test_a_mistake_in_the_file_of_claims_is_named(tmp_path: Path, old, new, said) -> None:
+    text = (ROOT / STUDY.claims).read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "claims.yaml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigError) as refusal:
+        read_claims(STUDY, path)
+    message = str(refusal.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    assert all(words in message for words in said), message
+
+
+def test_what_a_study_lacks_for_a_family() -> None:
+    for title, family in CLAIMS.families.items():
+        parts = [part for _, part in parts_of(family)]
+        names = {name for part in parts for name in (*part.environments, part.variant, *part.over)}
+        settings = QUESTIONED
+        assert CLAIMS.lacking(names, names, settings)[title] == []
+        for name in names:
+            assert CLAIMS.lacking(names - {name}, names - {name}, settings)[title] == [name]
+        bare = settings.model_copy(update={"reference_return": {}})
+        (first, *_) = CLAIMS.lacking(names, names, bare)[title]
+        assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))

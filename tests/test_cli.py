@@ -17,8 +17,8 @@ from snakemake.utils import update_config
 from mace_rl import cli
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import load_study
 from mace_rl.runs import run
+from mace_rl.study.config import load_study
 
 CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 

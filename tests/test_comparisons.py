@@ -9,11 +9,11 @@ import pytest
 import scipy.stats
 from invented import SEEDS, expanded, table_for_scores, table_for_tables
 
-from mace_rl.config.study import Study, read_study
-from mace_rl.results import aggregate as a
-from mace_rl.results.comparisons import comparisons
-from mace_rl.results.metrics import all_metrics
-from mace_rl.results.statistics import logrank, probability_of_improvement
+from mace_rl.study.compare import aggregate as a
+from mace_rl.study.compare.comparisons import comparisons
+from mace_rl.study.compare.statistics import logrank, probability_of_improvement
+from mace_rl.study.config import Study, read_study
+from mace_rl.study.measure.metrics import all_metrics
 
 SETTINGS = read_study([Path(__file__).parents[1] / "config.yaml"]).metrics.model_copy(
     update={"bootstrap_repetitions": 1000}

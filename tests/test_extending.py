@@ -9,13 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from invented import table_for_tables
 from shared import call
 
-from mace_rl.config.study import read_study
 from mace_rl.library import settings
-from mace_rl.results.metrics import LearningCurve, all_metrics
-from mace_rl.results.records import read_episodes
 from mace_rl.runs.agent import load_agent
+from mace_rl.runs.records import read_episodes
+from mace_rl.study.claims_config import read_claims
+from mace_rl.study.compare.summary import split, summary
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import LearningCurve, all_metrics
+from mace_rl.study.show import tables
+from mace_rl.study.show.latex import table1_latex
+from mace_rl.study.show.markdown import markdown
+from mace_rl.study.show.pictures import PICTURES, Source
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -57,6 +65,7 @@ def replace(file: Path, old: str, new: str) -> None:
 def test_every_example_is_one_file_and_one_entry():
     assert {Path(name).suffix for name in FILES} == {".py", ".yaml"}
     assert all(f"{Path(name).stem}.yaml" in FILES for name in FILES)
+    assert len(FILES["other_claims.yaml"].splitlines()) <= 24
     folders = {"layer_norm", "grid_counts", "linear_decay", "rnd", "chain", "growing_chain"}
     assert set(TRAININGS) == folders
 
@@ -113,6 +122,32 @@ def test_example_metric(folder):
     ):
         curve = LearningCurve(np.array(returns), 0.0, 0.0, metrics)
         assert metric.function(curve) == expected
+
+
+def test_another_paper_has_its_tables_verdicts_and_pictures(folder):
+    """Two invented claims on invented metrics: A1 holds, A2 does not."""
+    study = read_study([ROOT / "config.yaml", folder / "other.yaml"])
+    paper, settings = read_claims(study, study.claims), study.metrics
+    values = {"ppo": np.arange(12.0), "mace_fixed": 100 + np.arange(12.0)}
+    equal = dict.fromkeys(values, np.arange(12.0))
+    runs = table_for_tables(
+        *(all_metrics(settings), study.environments, study.variants, 12),
+        final_return=values,
+        early_return=equal,
+    )
+    answers = ledger(runs, settings, paper)
+    assert [one.ways["by return"].verdict for one in answers] == ["reproduced", "not reproduced"]
+    assert answers[0].paper == "final_return: A 180.5, B 320; the best is B"
+    assert answers[0].ways["by return"].parts[0].in_paper == 139.5
+    table1, rest = split(summary(runs, settings, paper.table1), paper.table1)
+    assert len(table1) == 2 and "final_return" not in set(rest["metric"])
+    latex = table1_latex(table1, study.labels, settings, paper.table1)
+    assert r"\caption{Final return. The best mean is \textbf{bold}." in latex
+    assert r"\textbf{105.5}" in latex and "paper" not in latex
+    page = markdown(tables.table1(table1, settings, paper.table1))
+    assert "| **105.5** (" in page and "; paper: 320.0 |" in page and "| 5.5 (" in page
+    forest = PICTURES["forest"].data(Source({}, answers, settings, paper))
+    assert list(forest["part"]) == ["over A"] * 2 and list(forest["paper"].notna()) == [True, False]
 
 
 @pytest.mark.parametrize(

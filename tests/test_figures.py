@@ -13,11 +13,11 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from mace_rl.config.results import FigureConfig
-from mace_rl.config.study import read_study
-from mace_rl.report.panels import MAX_POINTS, _thinned
-from mace_rl.results.figures import (
-    Look,
+from mace_rl.runs.records import RecordError
+from mace_rl.study.config import read_study
+from mace_rl.study.metrics_config import FigureConfig
+from mace_rl.study.show.curves import (
+    PlotStyle,
     draw_figure,
     figure_as_svg,
     mean_curves,
@@ -25,7 +25,6 @@ from mace_rl.results.figures import (
     save_figure,
     seed_curves,
 )
-from mace_rl.results.records import RecordError
 
 STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
@@ -54,7 +53,7 @@ def data(shown=RETURN, runs=None, **shape):
 
 def draw(colours=COLOURS, shown=RETURN, runs=None, inset=None, **shape):
     layout = FigureConfig(columns=3, inset=inset)
-    look = Look(layout, 0.95, LABELS, colours)
+    look = PlotStyle(layout, 0.95, LABELS, colours, {})
     return draw_figure(*data(shown, runs, **shape), shown, look)
 
 
@@ -77,13 +76,6 @@ def test_a_seeds_curve_is_the_mean_of_the_episodes_so_far_and_ends_at_the_last(e
         assert curve["episode"].tolist() == sorted(kept)
         expected = run["extrinsic_return"].rolling(5, min_periods=1).mean()
         np.testing.assert_allclose(curve["moving_average"], expected[curve["episode"] - 1])
-
-
-def test_the_panels_of_the_page_are_thinned_and_end_at_the_last_episode():
-    frame = pd.DataFrame({"episode": np.tile(np.arange(1, 1002), 2), "variant": "ppo"})
-    kept = _thinned(frame)["episode"].to_numpy().reshape(2, -1)
-    assert (kept == np.arange(1001, 0, -math.ceil(1001 / MAX_POINTS))[::-1]).all()
-    assert len(kept[0]) <= MAX_POINTS == len(_thinned(frame.head(MAX_POINTS)))
 
 
 @pytest.mark.parametrize("shown", [RETURN, BETA], ids=["return", "beta"])
@@ -173,9 +165,10 @@ def test_the_same_data_gives_the_same_file_and_another_colour_does_not(tmp_path,
 def test_importing_results_modules_is_quick():
     """Planning the workflow imports them; tables and figures do without torch altogether."""
     heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}
-    slow = heavy | {"pandas", "matplotlib.figure", "seaborn", "scipy.stats"}
-    code = "import sys, mace_rl.results.{}; print(*(set({}) & set(sys.modules)))"
-    for module, forbidden in (("figures", slow), ("tables", heavy), ("comparisons", heavy)):
+    slow = {"pandas", "matplotlib.figure", "seaborn", "scipy.stats", "torch", "numba"}
+    code = "import sys, mace_rl.study.{}; print(*(set({}) & set(sys.modules)))"
+    modules = {"claims_config": slow, "show.tables": heavy, "compare.comparisons": heavy}
+    for module, forbidden in modules.items():
         command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
         run = subprocess.run(command, capture_output=True, text=True, check=True)
         assert run.stdout.split() == []

@@ -7,68 +7,17 @@ from pathlib import Path
 
 import pytest
 import yaml
-from invented import digits_of, table_for_claims
 
-from mace_rl.config.study import read_study
-from mace_rl.results.claims import ledger
-from mace_rl.results.protocol import FAMILIES, ROBUST
-from mace_rl.results.renderings import number
 from mace_rl.runs.run import run
-from tools import kept_runs, tables
+from mace_rl.study.config import read_study
+from tools import kept_runs
 
 ROOT = Path(__file__).parents[1]
-SETTINGS = read_study([ROOT / "config.yaml"]).metrics
-SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 500})
-
-
-def test_each_script_has_a_process_of_its_own_and_how_it_ended_is_heard(tmp_path: Path) -> None:
-    script, trace = tmp_path / "script.py", tmp_path / "trace"
-    jobs, scripts = tables.fork.Pipe()
-    server = tables.fork.Process(target=tables.run_scripts, args=(scripts, [(jobs, scripts)]))
-    server.start()
-    scripts.close()
-    note = f"import os\nopen({str(trace)!r}, 'a').write(f'{{__name__}} {{os.getpid()}}\\n')\n"
-    found = []
-    for end in ("", "raise SystemExit(3)", "raise ValueError", "os.kill(os.getpid(), 9)"):
-        script.write_text(note + end, encoding="utf-8")
-        jobs.send(str(script))
-        found.append(jobs.recv())
-    assert found == [0, 3, 1, -9]
-    names, processes = zip(*map(str.split, trace.read_text().splitlines()), strict=True)
-    assert set(names) == {"__main__"} and len({*processes, str(server.pid)}) == 5
-    jobs.close()  # as where Snakemake is killed
-    server.join(10)
-    assert server.exitcode is not None
-
-
-def test_the_first_study_stands_beside_this_one_part_by_part() -> None:
-    noise = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
-    first, second = (
-        ledger(table_for_claims(seeds, noise, 0.1), SETTINGS, FAMILIES[:1]) for seeds in (11, 12)
-    )
-    page = tables.beside_the_first(first[2:], second)
-    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| C")]
-    said, parts = rows[:10], rows[10:]
-    for row, *claims in zip(said, second, [None, None, *first[2:]], strict=True):
-        now, before = (claim[ROBUST]["verdict"] if claim else "" for claim in claims)
-        assert row[-2:] == [before, now] if before else row[-1] == now
-    count = 0
-    for claim, other in zip(second[2:], first[2:], strict=True):
-        for part, old in zip(claim[ROBUST]["parts"], other[ROBUST]["parts"], strict=True):
-            row = parts[4 + count]  # C1 and C2 have two parts each
-            digits = digits_of(part)
-            assert [row[place] for place in (0, 4, 6, 7, 9)] == [
-                *(claim["claim"], "12", part["outcome"], "11", old["outcome"])
-            ]
-            for place, found in ((5, part), (8, old)):
-                assert row[place].startswith(f"{number(found['difference'], digits)} (")
-            count += 1
-    assert count == len(parts) - 4
 
 
 @pytest.mark.slow
 def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
-    for name in ("workflow", "profiles"):
+    for name in ("workflow", "profiles", "config"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("Snakefile", "config.yaml"):
         shutil.copy(ROOT / name, tmp_path)

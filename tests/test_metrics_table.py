@@ -8,11 +8,11 @@ import pandas as pd
 import pytest
 from invented import CONFIG, SETTINGS, frame, noisy
 
-from mace_rl.config.results import GOALS, MetricsConfig
 from mace_rl.config.section import ConfigError, check
-from mace_rl.results import metrics as m
-from mace_rl.results import metrics_table as t
-from mace_rl.results.records import RecordError, read_table
+from mace_rl.runs.records import RecordError, read_table
+from mace_rl.study.measure import metrics as m
+from mace_rl.study.measure import run_metrics as t
+from mace_rl.study.metrics_config import GOALS, MetricsConfig
 
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "env": "CartPole-v1",
@@ -158,20 +158,20 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
 
 NOT_FINITE = "is nan, but should be a finite number"
 NO_METRIC = [  # what is given, and what is said of it
-    (3, "is no mace_rl.results.metrics.Metric but of type int"),
+    (3, "is no mace_rl.study.measure.metrics.Metric but of type int"),
     (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
     (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
     (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
     (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
     (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
     (m.Metric("y", "Y", "return", lambda curve: np.nan), NOT_FINITE),
-    (m.Metric("y", "Y", "return", lambda curve: m.Episode(1, False)), "should be a finite number"),
+    (m.Metric("y", "Y", "return", lambda curve: m.Attained(1, False)), "should be a finite number"),
     (
         m.Metric("y", "Y", "episodes", lambda curve: 3.5),
         r"y of the run \('CartPole-v1', 'ppo', 3\) is 3.5",
     ),
-    (m.Metric("y", "Y", "episodes", lambda curve: m.Episode(0, False)), "y is 0 of 400 episodes"),
-    (m.Metric("y", "Y", "episodes", lambda curve: m.Episode(9, True)), "y is 9 of .*censored = 1"),
+    (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(0, False)), "y is 0 of 400 episodes"),
+    (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(9, True)), "y is 9 of .*censored = 1"),
 ]
 
 

@@ -1,26 +1,25 @@
 """Pictures of all runs at once: their data against loops, and that each can be drawn."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from invented import SEEDS, table_for_claims, table_for_questions, table_for_scores
-from matplotlib.figure import Figure
+from invented import CLAIMS, SEEDS, table_for_claims, table_for_questions, table_for_scores
 
-from mace_rl.config.results import ConstantsConfig, FigureConfig, MetricsConfig
-from mace_rl.config.study import Study, read_study
-from mace_rl.report.panels import svg
-from mace_rl.results.claims import ledger
-from mace_rl.results.figures import Look, figure_as_svg, save_figure
-from mace_rl.results.pictures import PICTURES
-from mace_rl.results.protocol import FAMILIES, WAYS
-from mace_rl.results.statistics import mean_interval
+from mace_rl.study.compare.ledger import Answer
+from mace_rl.study.compare.statistics import mean_interval
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import Study, read_study
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
+from mace_rl.study.show.curves import PlotStyle, save_figure
+from mace_rl.study.show.pictures import PICTURES, Source
 
 CONSTANTS = ["beta_1", "ppo"]
 ROOT = Path(__file__).parents[1]
 QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
+METRICS = {metric.name: metric.label for metric in all_metrics(QUESTIONED)}
 QUESTIONED = QUESTIONED.model_copy(update={"bootstrap_repetitions": 500})
 
 
@@ -35,12 +34,11 @@ def runs() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def ledgers() -> list[list[dict]]:
+def ledgers() -> list[list[Answer]]:
     """Of the paper's claims, and of our questions."""
     advantage = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
     tables = table_for_claims(12, advantage, 0.05), table_for_questions(12)
-    found = zip(tables, FAMILIES, strict=True)
-    return [ledger(table, QUESTIONED, [family]) for table, family in found]
+    return [ledger(table, QUESTIONED, CLAIMS) for table in tables]
 
 
 @pytest.fixture
@@ -50,7 +48,7 @@ def settings(study: Study) -> MetricsConfig:
 
 
 def test_every_run_is_there_with_its_returns(runs, settings) -> None:
-    table = PICTURES["every_seed"].data(runs, settings)
+    table = PICTURES["every_seed"].data(Source({"metrics": runs}, [], settings, CLAIMS))
     assert len(table) == 2 * len(runs)
     for row in table.sample(20, random_state=0).itertuples():
         own = runs[(runs["env"] == row.env) & (runs["seed"] == row.seed)]
@@ -58,10 +56,14 @@ def test_every_run_is_there_with_its_returns(runs, settings) -> None:
 
 
 def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings) -> None:
-    table = PICTURES["constants"].data(runs, settings)
+    table = PICTURES["constants"].data(Source({"metrics": runs}, [], settings, CLAIMS))
     names = sorted(set(table["variant"]))
-    look = Look(
-        FigureConfig(columns=3), 0.95, {name: name for name in names}, dict.fromkeys(names, "C0")
+    look = PlotStyle(
+        FigureConfig(columns=3),
+        0.95,
+        {name: name for name in names},
+        dict.fromkeys(names, "C0"),
+        {},
     )
     panels = PICTURES["constants"].draw(table, look).axes
     for (environment, rows), axes in zip(table.groupby("env", sort=False), panels, strict=False):
@@ -80,7 +82,9 @@ def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings)
 
 
 def test_a_seed_solves_its_task_if_nine_of_ten_last_episodes_do(runs, settings) -> None:
-    for row in PICTURES["solved"].data(runs, settings).itertuples():
+    for row in (
+        PICTURES["solved"].data(Source({"metrics": runs}, [], settings, CLAIMS)).itertuples()
+    ):
         own = runs[(runs["env"] == row.env) & (runs["variant"] == row.variant)]["solved"]
         assert (row.solved, row.seeds) == (sum(share >= 0.9 for share in own), len(own))
 
@@ -88,46 +92,33 @@ def test_a_seed_solves_its_task_if_nine_of_ten_last_episodes_do(runs, settings) 
 @pytest.mark.parametrize("family", [0, 1])
 def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, settings) -> None:
     ledger = ledgers[family]
-    table = PICTURES["forest"].data(ledger, settings)
-    assert set(table["measured"]) == {how for claim in ledger for how in claim if how in WAYS}
+    table = PICTURES["forest"].data(Source({}, ledger, settings, CLAIMS))
+    assert set(table["measured"]) == set(ledger[0].ways)
     for how, rows in table.groupby("measured"):
-        parts = [(claim, part) for claim in ledger for part in claim[how]["parts"]]
-        for (claim, part), (_, row) in zip(parts, rows.iterrows(), strict=True):
-            assert row["verdict"] == claim[how]["verdict"]
+        parts = [(one.ways[how], part) for one in ledger for part in one.ways[how].parts]
+        for (judged, part), (_, row) in zip(parts, rows.iterrows(), strict=True):
+            assert row["verdict"] == judged.verdict
             for name in ("difference", "low", "high"):
-                assert row[name] * part["worth_mentioning"] == pytest.approx(part[name])
-            assert np.isnan(row["paper"]) == (part["in_paper"] is None)
-            assert row["outcome"] == part["outcome"] and row["answer"] == claim[how]["outcome"]
+                assert row[name] * part.worth_mentioning == pytest.approx(getattr(part, name))
+            assert np.isnan(row["paper"]) == np.isnan(part.in_paper)
+            assert row["outcome"] == part.outcome and row["answer"] == judged.outcome
         assert not rows.duplicated(["claim", "part"]).any()  # the words tell parts from each other
 
 
-@pytest.mark.parametrize("name", [*PICTURES, "forest of questions"])
+@pytest.mark.parametrize(
+    "name", ["every_seed", "constants", "solved", "forest", "forest of questions"]
+)
 def test_every_picture_can_be_drawn_and_is_the_same_again(
     runs, ledgers, settings, study, tmp_path, name
 ):
     sources = {"forest": ledgers[0], "forest of questions": ledgers[1]}
-    source, name = sources.get(name, runs), name.removesuffix(" of questions")
+    source = Source({"metrics": runs}, sources.get(name, []), settings, CLAIMS)
+    name = name.removesuffix(" of questions")
     names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}
-    look = Look(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"))
-    table = PICTURES[name].data(source, settings)
+    look = PlotStyle(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"), METRICS)
+    table = PICTURES[name].data(source)
     table.to_csv(tmp_path / "table.csv", index=False)
     read = pd.read_csv(tmp_path / "table.csv", keep_default_na=False, na_values=[""])
     for path, data in (("a.png", table), ("b.png", read)):
         save_figure(PICTURES[name].draw(data, look), tmp_path / path)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
-def test_a_panel_of_the_page_says_and_shows_what_the_figure_does() -> None:
-    figure = Figure(figsize=(3, 2))
-    axes = figure.subplots()
-    axes.plot([0.975, 0.995], [0.123456, 0.2], alpha=0.19)
-    axes.set_yticks([0.125, 0.175])
-    whole, small = figure_as_svg(figure), svg(figure, "name", "label")
-    for shown in (r"<text[^>]*>([^<]*)<", r"opacity: ([\d.]+)", r"stroke-width: ([\d.]+)"):
-        assert re.findall(shown, small) == re.findall(shown, whole) != []
-    paths = [
-        re.findall(r"-?\d+(?:\.\d+)?", " ".join(re.findall(r' d="([^"]+)"', text)))
-        for text in (whole, small)
-    ]
-    np.testing.assert_allclose(*(np.array(path, float) for path in paths), atol=0.1)
-    assert max(len(number.partition(".")[2]) for number in paths[1]) == 1

@@ -114,7 +114,7 @@ import mace_rl.pins, hashlib, numpy as np
 from mace_rl.numerics import products
 from mace_rl.trainer import Trainer
 from mace_rl.config.reading import DEFAULTS
-from mace_rl.config.study import read_study
+from mace_rl.study.config import read_study
 draw = np.random.default_rng(0)
 found = hashlib.sha256()
 for rows, count, columns in [(1, 64, 512), (5, 3, 16), (13, 64, 80), (64, 256, 64)]:

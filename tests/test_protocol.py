@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from invented import LITERAL, PAPERS, QUESTIONS, ROBUST
 
 from mace_rl import files
-from mace_rl.config.study import read_study
-from mace_rl.results.claims import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
-from mace_rl.results.protocol import CLAIMS, CORRELATION, FAMILIES, LITERAL, QUESTIONS, ROBUST
+from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import CORRELATION
 from tools import kept_runs
 
+[CLAIMED], [ASKED] = PAPERS.families.values(), QUESTIONS.families.values()
 ROOT = Path(__file__).parents[1]
 BARREN = "BarrenRegion-v0"
 PAGE = ROOT / "docs" / "protocol.md"
@@ -33,23 +35,24 @@ def metrics(cell: str, column: int) -> set[str]:
     return set(re.findall("`([a-z_]+)`", cell)) or {CORRELATION}
 
 
-@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
-def test_claims_are_measured_as_the_page_says(claim) -> None:
-    named = metrics(ROWS[claim.name][1], 1) - {CORRELATION}  # C6: of one part
+@pytest.mark.parametrize("name", CLAIMED.claims)
+def test_claims_are_measured_as_the_page_says(name: str) -> None:
+    named = metrics(ROWS[name][1], 1) - {CORRELATION}  # C6: of one part
     for how, column in ((ROBUST, 2), (LITERAL, 3)):
-        expected = {part.metric for part in claim.parts[how]}
-        assert metrics(ROWS[claim.name][column], column) | named == expected
+        expected = {part.metric for part in CLAIMED.claims[name].parts[how]}
+        assert metrics(ROWS[name][column], column) | named == expected
 
 
 def test_questions_have_the_parts_that_the_page_has() -> None:
-    count = {claim.name: len(claim.parts[ROBUST]) for claim in QUESTIONS}
+    count = {
+        name: sum(len(part.each(QUESTIONS.table1)) for part in claim.parts[ROBUST])
+        for name, claim in ASKED.claims.items()
+    }
     # By its words: five tasks; three; three times five others; four; one and one.
     assert count == dict(
         zip(["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", "Q7", "Q8"], [5, 3, 5, 5, 5, 4, 1, 1], strict=True)
     )
-    assert {name for names in ROWS for name in names.split(", ")} >= {
-        claim.name for family in FAMILIES for claim in family.claims if claim.name[0] == "C"
-    }
+    assert {name for names in ROWS for name in names.split(", ")} >= set(CLAIMED.claims)
     assert f"{WORTH_MENTIONING:.0%}".replace("%", " %") in TEXT
     assert f"below {LEVEL}" in TEXT and f"fewer than {FEWEST_SEEDS} seeds" in TEXT
 

@@ -3,15 +3,17 @@
 import numpy as np
 import pandas as pd
 import pytest
+from invented import CLAIMS
 
-from mace_rl.config.study import Study
-from mace_rl.results import readings as r
-from mace_rl.results import tables
-from mace_rl.results.figures import Look
-from mace_rl.results.metrics_table import metrics_table
-from mace_rl.results.paper import PAPER_TABLE1
-from mace_rl.results.renderings import markdown
-from mace_rl.results.statistics import logrank
+from mace_rl.study.compare import readings as r
+from mace_rl.study.compare.statistics import logrank
+from mace_rl.study.config import Study
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.show import tables
+from mace_rl.study.show.curves import PlotStyle
+from mace_rl.study.show.markdown import markdown
+from mace_rl.study.show.pictures import PICTURES
 
 EPISODES = 400
 Frames = dict[tuple[str, str, int], pd.DataFrame]
@@ -41,7 +43,7 @@ def select(table: pd.DataFrame, reading: str, source: str) -> pd.DataFrame:
 def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
     frames: Frames, study: Study
 ) -> None:
-    table = r.readings(frames, study.metrics)
+    table = r.readings(frames, study.metrics, CLAIMS.table1)
     runs = metrics_table(frames, study.metrics)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     expected = runs.groupby("variant")["sample_efficiency_range"].mean()
@@ -52,7 +54,7 @@ def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
     # 6 runs all earlier than 6 others: two of C(12, 6) ways are as extreme.
     assert rows.loc["ppo", "p_value"] == pytest.approx(2 / 924)
     rows = select(table, "convergence_steps", r.PAPER)
-    published = {name: PAPER_TABLE1["CartPole-v1", name][1] for name in rows.index}
+    published = {"ppo": 660, "mace_fixed": 620, "mace_full": 634}
     assert rows["mean"].to_dict() == published
     assert rows["rank"].to_dict() == {"ppo": 3, "mace_fixed": 1, "mace_full": 2}
     for run, shuffled in r.shuffled(frames, study.metrics).items():
@@ -99,7 +101,9 @@ def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None
             if variant == "ppo" or seed < 3:
                 returns[100 + seed :] = 450.0
             frames["CartPole-v1", variant, seed] = records(returns)
-    rows = select(r.readings(frames, study.metrics), "sample_efficiency_range", r.RUNS)
+    rows = select(
+        r.readings(frames, study.metrics, CLAIMS.table1), "sample_efficiency_range", r.RUNS
+    )
     assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
     runs = metrics_table(frames, study.metrics).set_index("variant")
     times = {name: runs.loc[name, "sample_efficiency_range"].to_numpy(float) for name in rows.index}
@@ -116,9 +120,10 @@ def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> 
         update={"random_return": {"Other-v0": 20.0}, "reference_return": {}}
     )
     other = {("Other-v0", *run[1:]): frame for run, frame in frames.items()}
-    table = r.readings(other, settings)
+    table = r.readings(other, settings, CLAIMS.table1)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
-    look = Look(study.figure, 0.95, {name: name for name in colours}, colours)
-    figure = r.draw_readings(table, settings, look)
+    names = {metric.name: metric.label for metric in all_metrics(settings)}
+    look = PlotStyle(study.figure, 0.95, {name: name for name in colours}, colours, names)
+    figure = PICTURES["readings"].draw(table, look)
     assert [axes.get_title() for axes in figure.axes] == ["Other-v0"]

@@ -4,21 +4,22 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from invented import CLAIMS
 from shared import VARIANTS, finish
 
-from mace_rl.config.study import read_study
-from mace_rl.results.figures import (
-    Look,
+from mace_rl.runs.records import EpisodeRecord, RunKey, as_columns
+from mace_rl.study.compare.summary import split, summary
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.show.curves import (
+    PlotStyle,
     draw_figure,
     mean_curves,
     quantity,
     save_figure,
     seed_curves,
 )
-from mace_rl.results.latex import table1_latex
-from mace_rl.results.metrics_table import metrics_table
-from mace_rl.results.records import EpisodeRecord, RunKey, as_columns
-from mace_rl.results.summary import summary, table1
+from mace_rl.study.show.latex import table1_latex
 
 ROOT = Path(__file__).parents[1]
 EXPECTED = ROOT / "docs" / "reduced"
@@ -38,9 +39,9 @@ def runs() -> dict[RunKey, pd.DataFrame]:
 @pytest.mark.slow
 def test_table_1(runs):
     metrics = metrics_table(runs, METRICS)
-    table = table1(summary(metrics, METRICS))
+    table, _ = split(summary(metrics, METRICS, CLAIMS.table1), CLAIMS.table1)
     assert table.to_csv(index=False).encode() == (EXPECTED / "table1.csv").read_bytes()
-    latex = table1_latex(table, STUDY.labels, METRICS)
+    latex = table1_latex(table, STUDY.labels, METRICS, CLAIMS.table1)
     assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()
 
 
@@ -49,7 +50,7 @@ def test_table_1(runs):
 def test_figures(runs, tmp_path, number):
     shown = quantity(number, STUDY.metrics)
     single_seeds = seed_curves(runs, shown)
-    look = Look(STUDY.figure, STUDY.metrics.confidence, STUDY.labels, STUDY.colours)
+    look = PlotStyle(STUDY.figure, STUDY.metrics.confidence, STUDY.labels, STUDY.colours, {})
     curves = mean_curves(single_seeds, shown, STUDY.metrics)
     figure = draw_figure(curves, single_seeds, shown, look)
     name = f"figure{number}.png"

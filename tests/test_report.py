@@ -14,22 +14,23 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
+from invented import CLAIMS, ENVIRONMENTS, VARIANTS
 from PIL import Image
 
 from mace_rl import files
-from mace_rl.config.results import ConstantsConfig
-from mace_rl.config.study import read_study
 from mace_rl.refusal import Refusal
-from mace_rl.report.animations import animations
-from mace_rl.report.page import Making, _costs, duration, short
-from mace_rl.report.page import page as build
-from mace_rl.results.figures import Look
-from mace_rl.results.pages import read_data
-from mace_rl.results.paper import ENVIRONMENTS, VARIANTS
-from mace_rl.results.protocol import WAYS
-from mace_rl.results.renderings import number
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import ConstantsConfig
+from mace_rl.study.show.animations import animations
+from mace_rl.study.show.cells import number
+from mace_rl.study.show.curves import PlotStyle
+from mace_rl.study.show.report import Provenance, three_digits
+from mace_rl.study.show.report import page as build
+from mace_rl.study.show.sections import read_data
+from mace_rl.study.show.tables import costs
 from tools.tables import RULES
 
 ROOT = Path(__file__).parents[1]
@@ -141,7 +142,7 @@ def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -
     claims = page.all("ledger", "details")
     assert [found["id"] for found in claims] == [f"C{n}" for n in range(1, 11)]
     assert all(record["statement"] in page.words("ledger") for record in ledger)
-    rows = sum(len(record[how]["parts"]) for record in ledger for how in WAYS)
+    rows = sum(len(record[how]["parts"]) for record in ledger for how in CLAIMS.ways)
     assert len(page.all("ledger", "tr")) == rows + 2 * len(claims)
 
     # Figures have a panel for each environment.
@@ -198,10 +199,11 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     data["figure2"] = data["figure2"].head(0)
     records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
-    making = Making("a command", {}, ppo, records)
+    making = Provenance("a command", {}, ppo, records)
     films = animations({("CartPole-v1", v): made / v for v in VARIANTS}, study.labels, made)
-    look = Look(study.figure, settings.confidence, study.labels, study.colours)
-    how = making, films, settings, look
+    names = {metric.name: metric.label for metric in all_metrics(settings)}
+    look = PlotStyle(study.figure, settings.confidence, study.labels, study.colours, names)
+    how = CLAIMS, making, films, settings, look
     html = build(data, claims, *how)
     assert html == build(data, claims, *how)
     page = Page(html)
@@ -251,8 +253,7 @@ def test_costs_and_times() -> None:
     ]
     runs = [record["config"] for record in records]
     metrics = pd.DataFrame(runs).rename(columns={"environment": "env"}).assign(env_steps=7000)
-    plain, full = _costs(records, metrics[::-1], {"ppo": "PPO", "full": "Full"}).to_numpy().tolist()
-    assert plain == ["A-v0", "PPO", "3", "21", "10.0 s", "1.7 min", "1.9 min", "302"]
-    assert full[-2] == "3.7 min"
-    assert [duration(0.04), duration(7200)] == ["0.0 s", "2.0 h"]
-    assert list(map(short, (0.9921, -83.0, 1841.9, 0.0))) == ["0.992", "−83.0", "1842", "0"]
+    plain, full = costs(records, metrics[::-1], {"ppo": "PPO", "full": "Full"}).to_numpy().tolist()
+    assert plain == ["A-v0", "PPO", "3", "21", "10 s", "100 s", "2 min", "302"]
+    assert full[-2] == "4 min"
+    assert list(map(three_digits, (0.9921, -83.0, 1841.9, 0.0))) == ["0.992", "−83.0", "1842", "0"]

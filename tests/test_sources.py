@@ -12,9 +12,9 @@ PARTS = ("training", "everything")
 CHANGES = [  # of a file, and whether a training has other sources then
     ("agent/ppo.py", True),
     ("config/agent.py", True),
-    ("results/metrics.py", False),
-    ("results/records.py", True),
-    ("report/page.py", False),
+    ("study/measure/metrics.py", False),
+    ("runs/records.py", True),
+    ("study/show/report.py", False),
     ("a_new_file.py", True),
 ]
 

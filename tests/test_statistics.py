@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented import expanded
 
-from mace_rl.results import statistics as s
+from mace_rl.study.compare import statistics as s
 
 REPETITIONS = 5000
 FIVE = np.array([186.0, 201.0, 249.0, 140.0, 120.0])

@@ -18,7 +18,7 @@ from matplotlib.ft2font import FT2Font
 from mace_rl.config.reading import _read, read_options, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
-from mace_rl.config.study import LABEL, load_study, read_study
+from mace_rl.study.config import LABEL, load_study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 RULES = CONFIG.parent / "workflow" / "rules"
@@ -321,5 +321,5 @@ def test_planning_imports_nothing_slow() -> None:
     command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": "of a notebook"}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
-    assert "mace_rl.config.study" in loaded
+    assert "mace_rl.study.config" in loaded
     assert not loaded & {"torch", "numba", "pandas", "scipy.stats", "matplotlib.pyplot", "pybullet"}

@@ -14,33 +14,34 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
-from invented import digits_of, table_for_claims, table_for_tables
-
-from mace_rl.config.agent import PPOConfig, TorchModule
-from mace_rl.config.results import MetricsConfig
-from mace_rl.config.study import read_study
-from mace_rl.results import summary, tables
-from mace_rl.results.aggregate import aggregate
-from mace_rl.results.claims import ledger
-from mace_rl.results.comparisons import comparisons
-from mace_rl.results.latex import table1_latex, table2_latex
-from mace_rl.results.metrics import Metric, all_metrics, metrics_columns
-from mace_rl.results.pages import read_data, tables_page
-from mace_rl.results.paper import ENVIRONMENTS, PAPER_TABLE1, VARIANTS
-from mace_rl.results.protocol import FAMILIES, LITERAL, ROBUST
-from mace_rl.results.renderings import (
-    Cell,
-    Value,
-    as_html,
-    escaped,
-    estimate,
-    latex_cell,
-    markdown,
-    number,
-    plain,
+from invented import (
+    CLAIMS,
+    ENVIRONMENTS,
+    LITERAL,
+    PAPERS,
+    ROBUST,
+    STUDY,
+    VARIANTS,
+    digits_of,
+    table_for_claims,
+    table_for_tables,
 )
 
-STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
+from mace_rl.config.agent import PPOConfig, TorchModule
+from mace_rl.study.compare import summary
+from mace_rl.study.compare.aggregate import aggregate
+from mace_rl.study.compare.comparisons import comparisons
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_columns
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import Cell, Value, estimate, number
+from mace_rl.study.show.latex import escaped, latex_cell, table1_latex, table2_latex
+from mace_rl.study.show.markdown import markdown, plain
+from mace_rl.study.show.markdown import page as markdown_page
+from mace_rl.study.show.report import as_html
+from mace_rl.study.show.sections import of_ledger, of_runs, read_data
+
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
 metrics = partial(table_for_tables, all_metrics(SETTINGS))
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
@@ -51,11 +52,11 @@ PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(
 
 
 def table1(runs: pd.DataFrame, settings: MetricsConfig = SETTINGS) -> pd.DataFrame:
-    return summary.table1(summary.summary(runs, settings))
+    return summary.split(summary.summary(runs, settings, CLAIMS.table1), CLAIMS.table1)[0]
 
 
 def supplement(runs: pd.DataFrame, settings: MetricsConfig = SETTINGS) -> pd.DataFrame:
-    return summary.supplement(summary.summary(runs, settings))
+    return summary.split(summary.summary(runs, settings, CLAIMS.table1), CLAIMS.table1)[1]
 
 
 def cells(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
@@ -71,7 +72,9 @@ def cells(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
 def table1_of(**values: object) -> dict[tuple[str, str], str]:
     """The cells of Table 1 for CartPole."""
     variants = list(next(iter(values.values())))  # type: ignore[call-overload]
-    return cells(tables.table1(table1(metrics(["CartPole-v1"], variants, **values), SETTINGS)))
+    return cells(
+        tables.table1(table1(metrics(["CartPole-v1"], variants, **values)), SETTINGS, CLAIMS.table1)
+    )
 
 
 def test_summary_against_pandas_and_scipy() -> None:
@@ -84,19 +87,9 @@ def test_summary_against_pandas_and_scipy() -> None:
         expected = values.mean(), max(low, 1), min(high, 2000)
         assert (row.mean, row.low, row.high) == pytest.approx(expected)
         assert (row.seeds, row.censored, row.episodes) == (5, 0, 2000)
-        assert row.paper == PAPER_TABLE1[row.env, row.variant][row.metric == "convergence_steps"]
+        assert row.paper == CLAIMS.table1.value(row.env, row.variant, row.metric)
     other = table1(metrics(["Pendulum-v1"], ["ppo"]), SETTINGS)
     assert other["paper"].isna().all()
-
-
-def test_no_cell_depends_on_another_environment_or_variant() -> None:
-    """Bootstrap intervals included: more columns do not change a number."""
-    all_of_it = metrics(seeds=12)
-    part = all_of_it[(all_of_it["env"] == "CartPole-v1") & (all_of_it["variant"] == "mace_full")]
-    alone, among = table1(part, SETTINGS), table1(all_of_it, SETTINGS)
-    among = among[(among["env"] == "CartPole-v1") & (among["variant"] == "mace_full")]
-    alone, among = (frame.reset_index(drop=True) for frame in (alone, among))
-    pd.testing.assert_frame_equal(alone, among, check_exact=True)
 
 
 def test_table_1_has_bold_ties_censored_means_and_the_papers_numbers() -> None:
@@ -190,7 +183,7 @@ def test_table_2_has_the_papers_rows_then_ours() -> None:
         "network": TorchModule(kind="torch", module="my_nets:layer_norm"),
     }
     fragment = table2_latex(
-        {"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": PPO.model_copy(update=changes)}
+        {"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": PPO.model_copy(update=changes)}, CLAIMS.table2
     )
     paper, ours = fragment.split(r"\midrule")[1:]
     assert re.findall(r"\\raggedright (.*) \\\\", paper) == [
@@ -223,7 +216,7 @@ def test_the_caption_names_intervals_and_budgets(fewest: int, expected: str) -> 
     hopper = frame["env"] == "HopperBulletEnv-v0"
     frame.loc[hopper, "episodes"] = 6000
     fragment = table1_latex(
-        table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS), {}, SETTINGS
+        table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS), {}, SETTINGS, CLAIMS.table1
     )
     assert expected in fragment
     assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
@@ -275,9 +268,12 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     many["episodes"] = 6000
     labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
     fragments = [
-        table1_latex(table1(many, SETTINGS), labels, SETTINGS),
-        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS),
-        table2_latex({"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})}),
+        table1_latex(table1(many, SETTINGS), labels, SETTINGS, CLAIMS.table1),
+        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS, CLAIMS.table1),
+        table2_latex(
+            {"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})},
+            CLAIMS.table2,
+        ),
     ]
     assert re.findall(r"Algorithm & (.*) \\\\", fragments[0]) == [
         *(" & ".join(ENVIRONMENTS), r"Under\_score-v0 & MountainCarContinuous-v0")  # below
@@ -321,27 +317,24 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     }
     data |= {"metrics": runs, "betas": runs[["env", "variant", "seed"]].assign(**beta)}
     equal = dict.fromkeys(VARIANTS, 0.0)
-    claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, FAMILIES[:1])
-    page = tables_page(data, claims, ["figure1"], SETTINGS, "Made by hand.")
-    sections = re.findall("(?m)^## (.*)", page)
-    assert len(sections) == len(set(sections))
+    claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, PAPERS)
+    shown = [*of_ledger(claims, CLAIMS), *of_runs(data, CLAIMS, SETTINGS, {})]
+    page = markdown_page("Tables", "Made by hand.", shown, ["figure1"])
+    assert page.startswith("# Tables\n\nMade by hand.\n\n![figure1](figure1.png)\n\n## The paper's")
+    titles = re.findall("(?m)^## (.*)", page)
+    assert len(titles) == len(set(titles))
     assert re.findall("(?m)^### Part by part: (.*)", page) == [LITERAL, ROBUST]
-    assert "![figure1](figure1.png)" in page and "Made by hand." in page
     assert f"{LITERAL}: 0 reproduced, 0 reversed, 10 not reproduced, 0 open" in page
     row = data["comparisons"].set_index(["env", "metric", "variant", "baseline"])
     row = row.loc["CartPole-v1", "area_under_curve", "mace_full", "ppo"]
-    low, high = number(row["probability_low"], 2), number(row["probability_high"], 2)
-    assert f"{number(row['probability'], 2)} ({low} to {high})" in page
     assert f"| {number(row['p_value'], 4)} | {number(row['p_holm'], 4)} |" in page
-    score = data["aggregate"].iloc[0]
-    assert f"{number(score['mean'], 3)} ({number(score['mean_low'], 3)} to" in page
     assert "| mace_full | 10 | 0.50, 0.50, 0.50 | 0.00, 0.45, 0.90 |" in page
-    for part in (part for claim in claims for part in claim[ROBUST]["parts"]):
+    for part in (part for claim in claims for part in claim.ways[ROBUST].parts):
         digits = digits_of(part)
-        shown = (number(part[name], digits) for name in ("difference", "low", "high"))
+        shown = (number(getattr(part, name), digits) for name in ("difference", "low", "high"))
         assert "{} ({} to {})".format(*shown) in page
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
     alone = {name: make(runs.iloc[:10], SETTINGS) for name, make in kinds.items()}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}
-    page = tables_page(alone, (), [], SETTINGS, "")
+    page = markdown_page("", "", of_runs(alone, CLAIMS, SETTINGS, {}))
     assert not re.search("who is better|claims|environments together|## β|!\\[|nan", page)

@@ -11,8 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
 
-from mace_rl.config.study import Study, read_study
 from mace_rl.environments.tasks import BarrenRegion, DeepSea, NoisyDeepSea
+from mace_rl.study.config import Study, read_study
 
 ROOT = Path(__file__).parents[1]
 NORTH, EAST, SOUTH, WEST = range(4)

@@ -16,13 +16,13 @@ from shared import LAYER_NORM, VARIANTS, Bonanza, Twin, finish
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.config.reading import merge
-from mace_rl.config.study import read_study
 from mace_rl.experience import Experience
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.refusal import Refusal
-from mace_rl.results.records import EpisodeRecord
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
+from mace_rl.runs.records import EpisodeRecord
+from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}

@@ -30,6 +30,7 @@ RUNS = [f"runs/{env}/{variant}/seed0" for env in ENVIRONMENTS for variant in VAR
 EVALUATION = {"metrics": 1, "tables": 1, "tables_page": 1}
 EVALUATION |= {"figure": 2, "picture": 1, "readings": 1}
 TABLES = {"tables": 1, "tables_page": 1}
+PAPERS = TABLES | {"table2": 1, "picture": 1, "readings": 1}  # what the paper says is used by
 DRAWN = {"figure": 2, "picture": 1, "readings": 1}
 
 
@@ -160,14 +161,16 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     (CONFIG, "capacity: 1000", "capacity: 999", TRAIN | {"train": 4}),  # what the bonus uses
     (CONFIG, "{kind: meta, initial: 0.4}", "{kind: meta, initial: 0.5}", TRAIN | {"train": 2}),
     (
-        *(CONFIG, "    clip: 0.2 # [P] Table 2, ε\n    gae_lambda: 0.99 # [C]"),
+        *(CONFIG, "    clip: 0.2 # [P] Table 2, ε (clip_range)\n    gae_lambda: 0.99 # [C]"),
         *("    gae_lambda: 0.99\n    clip: 0.2 # [C]", {}),  # the order of keys, and a comment
     ),
     (CONFIG, "seeds: [0]", "seeds: [0, 1]", TRAIN),
     (CONFIG, ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
     ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN | {"table2": 1}),
-    ("src/mace_rl/results/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
+    ("src/mace_rl/study/measure/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
     ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
+    ("workflow/scripts/evaluate.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
+    ("config/claims.yaml", "[140, 660]", "[141, 660]", PAPERS),
     (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),
         {**TABLES, "picture": 1},
@@ -222,6 +225,7 @@ def test_a_damaged_result_is_named_on_the_terminal(finished: Project) -> None:
         ("--config sedes=[0]", "config.yaml: unknown key 'sedes'"),
         ("--configfile /nowhere.yaml", "/nowhere.yaml: cannot be read: No such file"),
         ("--configfiles config.yaml latin1.yaml", "latin1.yaml: cannot be read: it is not UTF-8"),
+        ("--config claims=config.yaml", "config.yaml: unknown key 'results'"),
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
     ],
 )

@@ -12,10 +12,10 @@ from typing import Any
 from mace_rl import files, outlets
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import folder_of
 from mace_rl.library import settings
 from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun, finished
+from mace_rl.study.config import folder_of
 
 logger = logging.getLogger(__name__)
 

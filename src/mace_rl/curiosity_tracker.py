@@ -15,7 +15,7 @@ from mace_rl.agent.scale import RewardScale
 from mace_rl.beta.controller import BetaController
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.config.beta import CustomBeta
-from mace_rl.config.section import ConfigError, short
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
@@ -161,7 +161,9 @@ class CuriosityTracker:
         theirs, mine = state["settings"], self.described()
         for name in sorted(theirs.keys() | mine.keys()):
             if name not in theirs or name not in mine or theirs[name] != mine[name]:
-                then, now = (short(x[name]) if name in x else "unknown" for x in (theirs, mine))
+                then, now = (
+                    short_repr(x[name]) if name in x else "unknown" for x in (theirs, mine)
+                )
                 raise ConfigError(
                     f"the state to load was made with {name} {then}, but here it is {now}"
                 )

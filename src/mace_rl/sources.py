@@ -13,14 +13,11 @@ from pathlib import Path
 PACKAGE = Path(__file__).parent
 # A training depends on all of this package but these: a new file counts until it stands here.
 NO_PART = (
-    *("results", "report", "wrappers.py", "curiosity_tracker.py", "library.py"),
-    *("cli.py", "__main__.py"),
-    *("config/reading.py", "config/results.py", "config/study.py", "config/wrappers.py"),
+    *("study", "wrappers.py", "curiosity_tracker.py", "library.py", "cli.py", "__main__.py"),
+    *("config/reading.py", "config/wrappers.py"),
     *("runs/evaluate.py", "runs/events.py", "runs/export.py"),
     *("runs/progress.py", "runs/queueing.py", "runs/verify.py", "runs/watch.py"),
 )
-# The form of a run's records, which is the training's as well.
-SHARED = ("results/__init__.py", "results/records.py")
 
 
 def digest(part: str, *own: Path) -> str:
@@ -36,11 +33,8 @@ def digest(part: str, *own: Path) -> str:
 def files(part: str) -> list[Path]:
     """The source files of this package: "everything", or what a "training" depends on."""
     left_out = [PACKAGE / name for name in NO_PART] if part == "training" else []
-    shared = [PACKAGE / name for name in SHARED]
     return sorted(
-        file
-        for file in PACKAGE.rglob("*.py")
-        if file in shared or not {file, *file.parents}.intersection(left_out)
+        file for file in PACKAGE.rglob("*.py") if not {file, *file.parents}.intersection(left_out)
     )
 
 

@@ -1,4 +1,4 @@
-# The ledger, for a study that has all of the protocol's claims, or of its questions.
+# The ledger, for a study that has all that a family of claims is about.
 
 
 rule claims:
@@ -6,6 +6,7 @@ rule claims:
         metrics=f"{RESULTS}/metrics.csv",
         betas=f"{RESULTS}/betas.csv",
         records=RECORDS,
+        claims=CLAIMS,
     output:
         json=f"{RESULTS}/claims.json",
         markdown=report(f"{RESULTS}/claims.md", caption="../report/claims.rst", category="Results"),
@@ -15,6 +16,6 @@ rule claims:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
         command=COMMAND,
-        code=code("claims.py", MEASURED),
+        code=code("evaluate.py", MEASURED),
     script:
-        "../scripts/claims.py"
+        "../scripts/evaluate.py"

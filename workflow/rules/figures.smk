@@ -25,15 +25,16 @@ rule figure:
         settings=study.metrics.model_dump(exclude={"custom"}),
         labels=study.labels,
         colours=study.colours,
-        code=code("figure.py"),
+        code=code("evaluate.py"),
     script:
-        "../scripts/figure.py"
+        "../scripts/evaluate.py"
 
 
-# Of all runs at once: `PICTURES` of mace_rl.results.pictures, the forest plot of the claims below.
+# Of all runs at once: `PICTURES` of mace_rl.study.show.pictures, those of other data below.
 rule picture:
     input:
-        f"{RESULTS}/metrics.csv",
+        metrics=f"{RESULTS}/metrics.csv",
+        claims=CLAIMS,
     output:
         data=f"{RESULTS}/{{picture}}.csv",
         pdf=f"{RESULTS}/{{picture}}.pdf",
@@ -50,41 +51,41 @@ rule picture:
         settings=MEASURED.model_dump(),
         labels=study.labels,
         colours=study.colours,
-        code=code("picture.py", MEASURED),
+        code=code("evaluate.py", MEASURED),
     script:
-        "../scripts/picture.py"
+        "../scripts/evaluate.py"
 
 
-if CLAIMS:
+if LEDGER:
 
     localrules:
         forest,
 
     use rule picture as forest with:
         input:
-            CLAIMS[0],
+            **LEDGER,
+            claims=CLAIMS,
         wildcard_constraints:
             picture="forest",
 
 
-rule readings:
-    input:
-        episodes=EPISODES,
-        records=RECORDS,
-    output:
-        table=f"{RESULTS}/readings.csv",
-        png=report(
-            f"{RESULTS}/readings.png", caption="../report/readings.rst", category="Supplement"
-        ),
-        pdf=f"{RESULTS}/readings.pdf",
-    log:
-        f"{RESULTS}/logs/readings.log",
-    params:
-        runs=TRAININGS,
-        layout=study.figure.model_dump(),
-        settings=MEASURED.model_dump(),
-        labels=study.labels,
-        colours=study.colours,
-        code=code("readings.py", MEASURED),
-    script:
-        "../scripts/readings.py"
+if READ:
+
+    localrules:
+        readings,
+
+    use rule picture as readings with:
+        input:
+            episodes=EPISODES,
+            records=RECORDS,
+            claims=CLAIMS,
+        output:  # the PNG first: a figure that is laid out once more is a little different
+            data=f"{RESULTS}/{{picture}}.csv",
+            png=report(
+                f"{RESULTS}/{{picture}}.png",
+                caption="../report/picture.rst",
+                category="Supplement",
+            ),
+            pdf=f"{RESULTS}/{{picture}}.pdf",
+        wildcard_constraints:
+            picture="readings",

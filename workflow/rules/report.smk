@@ -7,16 +7,14 @@ REPORTED = {
     **{
         name: f"{RESULTS}/{name}.csv"
         for name in (
-            *("metrics", "table1", "supplement", "comparisons", "aggregate"),
-            *("readings", "figure1", "figure1_seeds", "figure2", "figure2_seeds"),
+            *("metrics", "betas", "table1", "supplement", "comparisons", "aggregate"),
+            *("figure1", "figure1_seeds", "figure2", "figure2_seeds", *READ),
         )
     },
     "records": RECORDS,
     # To these the page refers.
     "in_print": [f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
 }
-if CLAIMS:
-    REPORTED["claims"] = CLAIMS[0]
 
 
 # The agents that are shown are no inputs: where runs are kept without them, the page says so. Each
@@ -24,6 +22,8 @@ if CLAIMS:
 rule page:
     input:
         **REPORTED,
+        **LEDGER,
+        claims=CLAIMS,
     output:
         f"{RESULTS}/report.html",
     log:
@@ -34,10 +34,13 @@ rule page:
         labels=study.labels,
         colours=study.colours,
         command=COMMAND,
-        configuration={file: Path(file).read_text(encoding="utf-8") for file in config_files},
+        layout={"columns": 3},
+        configuration={
+            file: Path(file).read_text(encoding="utf-8") for file in (*config_files, CLAIMS)
+        },
         ppo=ppo_settings(),
         own=own_code(),
-        template=provenance.file_digest(PACKAGE / "report" / "page.html"),
-        code=code("report.py", MEASURED),
+        template=provenance.file_digest(PACKAGE / "study" / "show" / "report.html"),
+        code=code("evaluate.py", MEASURED),
     script:
-        "../scripts/report.py"
+        "../scripts/evaluate.py"

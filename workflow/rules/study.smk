@@ -12,11 +12,11 @@ from pathlib import Path
 from mace_rl import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
-from mace_rl.config.study import folder_of, load_study
+from mace_rl.study.config import folder_of, load_study
 from mace_rl.config.plugins import code_outside, source_files
 from mace_rl.environments import registered
-from mace_rl.results import paper, protocol
-from mace_rl.results.metrics import all_metrics
+from mace_rl.study.claims_config import read_claims
+from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
 
@@ -37,6 +37,10 @@ except ConfigError as error:
 try:
     MEASURED = study.metrics.within(study.environments, study.variants)
     all_metrics(MEASURED)  # the user's own among them: are they metrics?
+    # Here, or else in the project: as where Snakemake is started in another folder.
+    places = [Path(study.claims), Path(workflow.basedir, study.claims)]
+    CLAIMS = os.path.relpath(next(filter(Path.exists, places), places[0]))
+    paper = read_claims(study, CLAIMS)
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {origin}: {error}")
 
@@ -48,15 +52,17 @@ EPISODES = [
     f"{RUN}/{files.EPISODES}".format(env=folder_of(e), variant=v, seed=s) for e, v, s in RUNS
 ]
 RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
-HAS_PAPERS = paper.has_all(study.environments, study.variants)
-# The ledger is for a study that has all of the protocol's claims or questions, and one bar for all.
-ASKS = bool(protocol.asked(study.environments, study.variants))
-CLAIMS = [f"{RESULTS}/claims.json", f"{RESULTS}/claims.md"]
-CLAIMS = CLAIMS if ASKS and MEASURED.reference_return else []
+HAS_PAPERS = paper.table1.is_within(study.environments, study.variants)
+# What counts episodes can be read in several ways.
+COUNTED = [metric.name for metric in all_metrics(MEASURED) if metric.unit == "episodes"]
+READ = ["readings"] if set(COUNTED) & set(paper.table1.metrics) else []
+# The ledger is for a study that has all that a family of claims is about.
+LACKING = paper.lacking(study.environments, study.variants, MEASURED)
+LEDGER = {} if all(LACKING.values()) else {"ledger": f"{RESULTS}/claims.json"}
 PICTURES = ["every_seed"]  # and what the configuration has the numbers for
 PICTURES += ["constants"] if MEASURED.constants else []
 PICTURES += ["solved"] if MEASURED.solved_return else []
-PICTURES += ["forest"] if CLAIMS else []
+PICTURES += ["forest"] if LEDGER else []
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = [option for option in options if not option.startswith("results=")]
 COMMAND = ["snakemake", "all"]

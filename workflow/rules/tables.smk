@@ -1,4 +1,22 @@
-# The paper's tables, whether their differences are more than chance, and all of it on one page.
+# What is measured on each run; the paper's tables, whether their differences are more than chance,
+# and all of it on one page.
+
+
+rule metrics:
+    input:
+        episodes=EPISODES,
+        records=RECORDS,
+    output:
+        metrics=f"{RESULTS}/metrics.csv",
+        betas=f"{RESULTS}/betas.csv",
+    log:
+        f"{RESULTS}/logs/metrics.log",
+    params:
+        runs=TRAININGS,
+        settings=MEASURED.model_dump(),
+        code=code("evaluate.py", MEASURED),
+    script:
+        "../scripts/evaluate.py"
 
 
 SUPPLEMENT = {
@@ -9,7 +27,8 @@ SUPPLEMENT = {
 
 rule tables:
     input:
-        f"{RESULTS}/metrics.csv",
+        metrics=f"{RESULTS}/metrics.csv",
+        claims=CLAIMS,
     output:
         **SUPPLEMENT,
         table1=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"),
@@ -22,32 +41,37 @@ rule tables:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
-        code=code("tables.py", MEASURED),
+        code=code("evaluate.py", MEASURED),
     script:
-        "../scripts/tables.py"
+        "../scripts/evaluate.py"
 
 
 rule table2:
+    input:
+        claims=CLAIMS,
     output:
         report(f"{RESULTS}/table2.tex", caption="../report/table2.rst", category="Methods"),
     log:
         f"{RESULTS}/logs/table2.log",
     params:
         ppo=ppo_settings(),
-        code=code("table2.py"),
+        code=code("evaluate.py"),
     script:
-        "../scripts/table2.py"
+        "../scripts/evaluate.py"
 
 
 TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
-TABULATED += ["readings"] if HAS_PAPERS else []  # seconds of work that only Table 1 is worth
+TABULATED += (
+    ["readings"] if READ and HAS_PAPERS else []
+)  # seconds of work that only Table 1 is worth
 
 
 # The pictures are no inputs: the page only names them.
 rule tables_page:
     input:
         **{name: f"{RESULTS}/{name}.csv" for name in TABULATED},
-        **({"claims": CLAIMS[0]} if CLAIMS else {}),
+        **LEDGER,
+        claims=CLAIMS,
     output:
         report(f"{RESULTS}/tables.md", caption="../report/tables.rst", category="Results"),
     log:
@@ -55,8 +79,8 @@ rule tables_page:
     params:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
-        pictures=["figure1", "figure2", *PICTURES, "readings"],
+        pictures=["figure1", "figure2", *PICTURES, *READ],
         command=COMMAND,
-        code=code("tables_page.py", MEASURED),
+        code=code("evaluate.py", MEASURED),
     script:
-        "../scripts/tables_page.py"
+        "../scripts/evaluate.py"

@@ -67,12 +67,12 @@ def outcome():
     if f"{RESULTS}/table1.csv" in made:
         import pandas  # only now: it takes as long as planning
 
-        from mace_rl.results import renderings, tables
+        from mace_rl.study.show import markdown, tables
 
         names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
         data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
-        table = tables.table1(tables.named(data, study.labels))
-        lines = [f"\n{TITLE}\n", renderings.plain(table), ""]
+        table = tables.table1(tables.named(data, study.labels), MEASURED, paper.table1)
+        lines = [f"\n{title()}\n", markdown.plain(table), ""]
     lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
     lines += textwrap.wrap(", ".join([*lie, *sorted(asked.difference(lie))]), 100)
     if f"{RESULTS}/tables.md" in made and f"{RESULTS}/report.html" not in made:
@@ -80,7 +80,15 @@ def outcome():
     return "\n".join(lines)
 
 
-TITLE = "Table 1: sample efficiency / convergence steps in episodes; *: lowest; †k: k seeds never get there"
+def title():
+    from mace_rl.study.show.tables import counts_episodes
+
+    name = f"Table 1: {paper.table1.caption[0].lower()}{paper.table1.caption[1:]}"
+    if not counts_episodes(MEASURED, paper.table1):
+        return f"{name}; *: best"
+    return f"{name} in episodes; *: lowest; †k: k seeds never get there"
+
+
 SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
 LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
@@ -103,10 +111,8 @@ onstart:
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments, study.variants):
         logger.info(line)
-    if ASKS and not CLAIMS:
-        logger.info(
-            "claims.json and claims.md are left out: they need metrics.reference_return of every environment"
-        )
+    for title, lacking in {} if LEDGER else LACKING.items():
+        logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
     due = sum(run["due"] for run in planned["runs"])
     logger.info(
         f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}"

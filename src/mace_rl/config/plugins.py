@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.config.section import ConfigError, short
+from mace_rl.config.section import ConfigError, short_repr
 
 
 def code_outside(settings: Any) -> dict[str, str]:
@@ -75,7 +75,7 @@ def make(
     except ConfigError as error:
         raise ConfigError(f"{key} has {reference!r}: {error}") from None
     if not isinstance(made, kind):
-        raise ConfigError(f"{key} has {reference!r}, which returned {short(made)}")
+        raise ConfigError(f"{key} has {reference!r}, which returned {short_repr(made)}")
     return made
 
 

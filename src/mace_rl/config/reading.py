@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from mace_rl.config.section import ConfigError, short
+from mace_rl.config.section import ConfigError, short_repr
 
 Settings = dict[str, Any]
 
@@ -24,7 +24,7 @@ def read_yaml(path: Path) -> Settings:
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
     values = _read(text, str(path))
     if not isinstance(values, dict):
-        found = "empty" if values is None else short(values)
+        found = "empty" if values is None else short_repr(values)
         raise ConfigError(f"{path}: it is {found}, but should be keys with values")
     return values
 

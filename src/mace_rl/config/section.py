@@ -88,7 +88,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case "extra_forbidden":
             nearest = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0)
             return (
-                f"unknown key {key!r} (value {short(problem['input'])}); "
+                f"unknown key {key!r} (value {short_repr(problem['input'])}); "
                 f"the nearest known key is {nearest[0]!r}"
             )
         case "missing":
@@ -96,10 +96,10 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case _:
             reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
             reason = " ".join(reason.replace(" after validation, not 0", "").split())
-            return f"{key} is {short(problem['input'])}, but {reason}{_advice(problem)}"
+            return f"{key} is {short_repr(problem['input'])}, but {reason}{_advice(problem)}"
 
 
-def short(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """`repr` of a value, cut to 60 characters."""
     try:
         text = repr(value)
@@ -122,7 +122,7 @@ def _advice(problem: ErrorDetails) -> str:
         number = float(text)
         if wanted == "float_type" or (wanted == "int_type" and number.is_integer()):
             quotes = ", without quotes" if isinstance(value, str) else ""
-            return f" (write {short(int(number) if number.is_integer() else number)}{quotes})"
+            return f" (write {short_repr(int(number) if number.is_integer() else number)}{quotes})"
     return ""
 
 
@@ -151,8 +151,8 @@ def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The settings classes in a type: itself, or the members of a union."""
-    if get_origin(annotation) in (Union, types.UnionType, Annotated):
+    """The settings classes in a type: itself, or those of a union's members or a list's values."""
+    if get_origin(annotation) in (Union, types.UnionType, Annotated, dict, list):
         return [one for argument in get_args(annotation) for one in _sections(argument)]
     is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
     return [annotation] if is_section else []

@@ -1,4 +1,4 @@
-"""Making environments: Gymnasium's registry, generators that resume."""
+"""Provenance environments: Gymnasium's registry, generators that resume."""
 
 import copy
 import os
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from mace_rl.config.plugins import import_module
-from mace_rl.config.section import ConfigError, short
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
 from mace_rl.outlets import keep_open
@@ -109,7 +109,7 @@ class Environment(Spaces):
         with trying_out(f"environment {name!r}"):
             given: Any = self.env.reset(seed=int(seed.generate_state(1)[0]))
             if not (isinstance(given, tuple) and len(given) == 2):
-                raise TypeError(f"reset gave {short(given)}, not (observation, info)")
+                raise TypeError(f"reset gave {short_repr(given)}, not (observation, info)")
             if not isinstance(kept := self.env.unwrapped.np_random, np.random.Generator):
                 raise TypeError(f"np_random is a {type(kept).__name__}, not a Generator of NumPy's")
 

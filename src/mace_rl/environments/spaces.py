@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
-from mace_rl.config.section import ConfigError, short
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
 MOST_NUMBERS = 10**6  # in an observation or an action: every network has a row for each
@@ -68,7 +68,7 @@ class Spaces:
                 require_finite("the observation", given.astype(float), _after(step), TOO_LARGE)
             return vector
         raise ConfigError(
-            f"environment {self.name!r} gave the observation {short(observation)} of shape "
+            f"environment {self.name!r} gave the observation {short_repr(observation)} of shape "
             f"{given.shape}{_after(step)}, but its observation_space is {self.given_space}"
         )
 
@@ -81,8 +81,8 @@ class Spaces:
             return value
         if (found := _only(_array(value))) is None:
             raise ConfigError(
-                f"environment {self.name!r} gave {short(value)} as {what}{_after(step)}, but it "
-                "should be one number, or True or False"
+                f"environment {self.name!r} gave {short_repr(value)} as {what}{_after(step)}, but "
+                "it should be one number, or True or False"
             )
         return found
 
@@ -115,7 +115,8 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
     size = int(gymnasium.spaces.flatdim(space))
     if not 1 <= size <= MOST_NUMBERS:
         raise ConfigError(
-            f"environment {name!r} has {size} numbers in {short(space)}; 1 to {MOST_NUMBERS} work"
+            f"environment {name!r} has {size} numbers in {short_repr(space)}; 1 to"
+            f" {MOST_NUMBERS} work"
         )
 
 

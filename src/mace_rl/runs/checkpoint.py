@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from mace_rl.config.section import short
+from mace_rl.config.section import short_repr
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 
@@ -69,7 +69,7 @@ def require_plain(value: Any, place: str) -> None:
     """`CheckpointError` that names the `place` of what `unarchive` would not read again."""
     if type(value) not in PLAIN:
         right = "a tensor, number, text, list or dict, to be read without executing anything"
-        raise CheckpointError(f"{place} is {short(value)}, but should be {right}")
+        raise CheckpointError(f"{place} is {short_repr(value)}, but should be {right}")
     pairs = value.items() if isinstance(value, dict) else ()
     for key, item in enumerate(value) if isinstance(value, list | tuple) else pairs:
         require_plain(key, f"a key of {place}")

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 from mace_rl import files
 from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check, short
-from mace_rl.results.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
+from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.runs.provenance import difference, identity, read_record
+from mace_rl.runs.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
@@ -54,8 +54,8 @@ class FinishedRun:
         config = check(RunConfig, values, origin)
         for key, text in ({} if self.trust else code_outside(values)).items():
             raise ConfigError(
-                f"{origin}: {key} has {short(text)}, code from outside mace_rl: if you trust it, "
-                "give --trust (in a program: trust=True)"
+                f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: "
+                "if you trust it, give --trust (in a program: trust=True)"
             )
         return config
 

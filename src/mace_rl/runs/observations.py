@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from torch import Tensor
 
-from mace_rl.config.section import short
+from mace_rl.config.section import short_repr
 from mace_rl.refusal import Refusal
 
 
@@ -29,7 +29,7 @@ def encoded(given: Any, space: Space[Any], size: int) -> Tensor:
             if found.shape[-1:] == (size,) and found.numel() and found.isfinite().all():
                 return found
     shape = f" of shape {tuple(given.shape)}" if hasattr(given, "shape") else ""
-    what = f"{short(given)}{shape}, which is no finite observation of {space}"
+    what = f"{short_repr(given)}{shape}, which is no finite observation of {space}"
     if isinstance(given, tuple) and any(isinstance(one, Mapping) for one in given[-1:]):
         what += "; of what reset and step return, only the first is one"
     raise ObservationError(" ".join(f"the policy was given {what}".split()))

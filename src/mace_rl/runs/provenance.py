@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from mace_rl import sources
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check, short
+from mace_rl.config.section import check, short_repr
 from mace_rl.refusal import Refusal
 
 # The packages whose version can change a result.
@@ -78,7 +78,7 @@ def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") 
             if old != new:
                 return difference(old, new, f"{name}.")
         elif old != new:
-            return f"{name} was {short(old)} and is {short(new)}"
+            return f"{name} was {short_repr(old)} and is {short_repr(new)}"
     return "no difference"
 
 

@@ -1,1 +1,0 @@
-"""The report: one page with a study's verdicts, tables, figures, animations, costs and settings."""

@@ -1,1 +1,0 @@
-"""From the records of runs to metrics, tables and figures."""

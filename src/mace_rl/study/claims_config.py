@@ -1,0 +1,260 @@
+"""What a paper says, and what is asked of one's own: the file that `claims` in config.yaml names.
+
+Claims in families, each claim in parts that `compare.verdicts` judges; the paper's tables; and what
+all of it is called. `read_claims` checks the file against the study that names it.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, model_validator
+
+from mace_rl.config.agent import PPOConfig
+from mace_rl.config.reading import read_yaml
+from mace_rl.config.section import ConfigError, Section, check
+from mace_rl.environments import registered
+from mace_rl.study.config import Study, check_known
+from mace_rl.study.measure.metrics import CORRELATION, METRICS, all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+
+Names = Annotated[list[str], Field(min_length=1)]
+
+
+class Part(NamedTuple):
+    """In these environments, on this metric: `variant` is better than `baseline`."""
+
+    environments: tuple[str, ...]  # of several the mean of the differences, as shares of everything
+    metric: str
+    variant: str
+    baseline: str | None  # None: over 0
+    in_paper: float  # variant - baseline in the paper's Table 1; NaN where that has none
+
+
+class ReportConfig(Section):
+    """The head of the report."""
+
+    title: str
+    question: str
+    about: str
+    tasks: dict[str, str] = Field(default={})  # by environment, what an agent is to do there
+
+
+class Table1Config(Section):
+    """The paper's Table 1."""
+
+    caption: str  # the names of its metrics
+    metrics: Names  # readings of one are the metrics whose names begin with its name
+    shuffled: list[str] = Field(default=[])  # readings that are asked of shuffled returns, too
+    variants: Annotated[dict[str, str], Field(min_length=1)]  # and what the ledger calls them
+    # By environment and variant a number for each metric.
+    values: dict[str, dict[str, list[int | float]]]
+
+    def value(self, environment: str, variant: str, metric: str) -> float | None:
+        """What the paper has there; None where it has nothing."""
+        numbers = self.values.get(environment, {}).get(variant)
+        return numbers[self.metrics.index(metric)] if numbers and metric in self.metrics else None
+
+    def values_of(self, environments: Sequence[str], reading: str) -> dict[str, float]:
+        """By variant what the paper has of this reading's metric; nothing of several together."""
+        kinds = [place for place, kind in enumerate(self.metrics) if reading.startswith(kind)]
+        rows = self.values.get(environments[0], {}) if len(environments) == 1 else {}
+        return {name: rows[name][kinds[0]] for name in self.variants if kinds and rows}
+
+    def is_within(self, environments: Iterable[str], variants: Iterable[str]) -> bool:
+        """Whether a study of these has all that the table has."""
+        return set(self.values) <= set(environments) and set(self.variants) <= set(variants)
+
+
+class Table2Config(Section):
+    """The paper's Table 2; both by the settings of `ppo`."""
+
+    rows: dict[str, str] = Field(default={})  # what they are called there
+    others: dict[str, str] = Field(default={})  # what the paper leaves open
+
+
+class PartsConfig(Section):
+    """Parts of a claim that differ in environment and in what `variant` is better than."""
+
+    environments: Names  # a part for each ...
+    together: bool = False  # ... or, if true, one over all of them
+    metric: str
+    variant: str
+    over: list[str]  # a part for each; empty: over 0
+
+    @model_validator(mode="after")
+    def _over_others(self) -> "PartsConfig":
+        if self.variant in self.over:
+            raise ValueError(f"over has the variant itself, {self.variant!r}")
+        return self
+
+    def each(self, table1: Table1Config) -> list[Part]:
+        """The parts: environment by environment, in each the variants that it is over."""
+        groups = [self.environments] if self.together else [[env] for env in self.environments]
+        others: list[str | None] = [*self.over] or [None]
+        own = self.metric, self.variant
+        return [
+            Part(tuple(group), *own, other, self._in_paper(group, other, table1))
+            for group in groups
+            for other in others
+        ]
+
+    def _in_paper(self, group: list[str], other: str | None, table1: Table1Config) -> float:
+        values = table1.values_of(group, self.metric)
+        if self.variant in values and other in values:
+            return float(values[self.variant] - values[other])
+        return math.nan
+
+
+class ClaimConfig(Section):
+    """A claim or a question, and its parts, by one or several of `ways`."""
+
+    statement: str
+    parts: Annotated[
+        dict[str, Annotated[list[PartsConfig], Field(min_length=1)]], Field(min_length=1)
+    ]
+
+
+class WordsConfig(Section):
+    """What each kind of answer is called."""
+
+    shown: str
+    reversed: str
+    absent: str
+    open: str
+
+
+class FamilyConfig(Section):
+    """Claims whose parts are corrected together; all are measured in the same ways."""
+
+    words: WordsConfig
+    claims: Annotated[dict[str, ClaimConfig], Field(min_length=1)]
+
+    @property
+    def ways(self) -> list[str]:
+        """In which ways its claims are measured."""
+        return list(next(iter(self.claims.values())).parts)
+
+
+class ClaimsConfig(Section):
+    """The whole file."""
+
+    report: ReportConfig
+    variants: dict[str, str] = Field(default={})  # what they are called in few words
+    table1: Table1Config
+    table2: Table2Config = Field(default=Table2Config())
+    ways: dict[str, str]  # to measure a claim, each with what the report says of it
+    families: dict[str, FamilyConfig] = Field(default={})
+
+    def lacking(
+        self, environments: Iterable[str], variants: Iterable[str], settings: MetricsConfig
+    ) -> dict[str, list[str]]:
+        """By family, what a study of these lacks for the family's parts: nothing, if it is asked.
+
+        Parts of returns have their margin by `metrics.reference_return` of their environments.
+        """
+        has = {*environments, *variants, *(one.name for one in all_metrics(settings)), CORRELATION}
+        found = {}
+        for title, family in self.families.items():
+            parts = [part for _, part in parts_of(family)]
+            needed = [[*one.environments, one.variant, *one.over, one.metric] for one in parts]
+            goals = [env for one in parts for env in one.environments]
+            names = [name for name in chain.from_iterable(needed) if name not in has]
+            names += [
+                f"metrics.reference_return.{env}"
+                for env in goals
+                if env in has and env not in settings.reference_return
+            ]
+            found[title] = list(dict.fromkeys(names))
+        return found
+
+
+def parts_of(family: FamilyConfig) -> list[tuple[str, PartsConfig]]:
+    """All of a family's parts, each with the key of its claim and way."""
+    return [
+        (f"{name}.parts.{way}", part)
+        for name, claim in family.claims.items()
+        for way, parts in claim.parts.items()
+        for part in parts
+    ]
+
+
+def parse_claims(path: str | Path) -> ClaimsConfig:
+    """The file at `path`, whatever study it is for; a `ConfigError` with its first mistake."""
+    return check(ClaimsConfig, read_yaml(Path(path)), str(path))
+
+
+def read_claims(study: Study, path: str | Path) -> ClaimsConfig:
+    """The file that a study names, checked against it; a `ConfigError` with its first mistake."""
+    claims = parse_claims(path)
+    try:
+        _check_names(claims, study)
+        _check_form(claims)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return claims
+
+
+def _check_names(claims: ClaimsConfig, study: Study) -> None:
+    """Refuse a metric, variant, environment, way or setting that there is not."""
+    measured = all_metrics(study.metrics.within(study.environments, study.variants))
+    metrics = [metric.name for metric in (*METRICS, *measured)]
+    own = {*study.environments, *study.environment_settings}
+    known: dict[str, tuple[Iterable[str], str]] = {
+        "metric": ([*metrics, CORRELATION], "the metrics"),
+        "measured": ([metric.name for metric in measured], "what this study measures"),
+        "variant": ([*claims.variants, *study.variant_settings], "variants and variant_settings"),
+        "environment": ([*registered(), *own], "Gymnasium's registry"),
+        "way": (claims.ways, "ways"),
+        "setting": (PPOConfig.model_fields, "the settings of ppo"),
+    }
+    for key, kind, names in _names(claims):
+        for name in names:
+            if not (kind == "environment" and ":" in name):  # of another study's own
+                check_known(name, known[kind][0], key, known[kind][1])
+
+
+def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
+    """What the file names: key, kind and names."""
+    table1 = claims.table1
+    yield "table1.metrics", "measured", table1.metrics
+    yield "table1.shuffled", "measured", table1.shuffled
+    yield "table1.variants", "variant", table1.variants
+    yield "table1.values", "environment", table1.values
+    yield "table2", "setting", [*claims.table2.rows, *claims.table2.others]
+    yield "report.tasks", "environment", claims.report.tasks
+    for title, family in claims.families.items():
+        for name, claim in family.claims.items():
+            yield f"families.{title}.claims.{name}.parts", "way", claim.parts
+        for key, part in parts_of(family):
+            key = f"families.{title}.claims.{key}"
+            yield f"{key}.environments", "environment", part.environments
+            yield f"{key}.metric", "metric", [part.metric]
+            yield f"{key}.variant", "variant", [part.variant]
+            yield f"{key}.over", "variant", part.over
+
+
+def _check_form(claims: ClaimsConfig) -> None:
+    """Refuse a Table 1 with holes, and claims that cannot be told apart or judged together."""
+    table1, seen = claims.table1, set()
+    for environment, rows in table1.values.items():
+        for variant in {*rows, *table1.variants}:
+            numbers = rows.get(variant, [])
+            if variant not in table1.variants or len(numbers) != len(table1.metrics):
+                raise ConfigError(
+                    f"table1.values.{environment}.{variant} is {numbers}, but each of"
+                    f" table1.variants, and no other, should have {len(table1.metrics)} numbers"
+                )
+    for title, family in claims.families.items():
+        for name, claim in family.claims.items():
+            key = f"families.{title}.claims.{name}"
+            if name in seen:
+                raise ConfigError(f"{key} is there twice, but each claim should have its own name")
+            seen.add(name)
+            if list(claim.parts) != family.ways:
+                raise ConfigError(
+                    f"{key}.parts has {list(claim.parts)}, but should have {family.ways} as the"
+                    " first of its family"
+                )

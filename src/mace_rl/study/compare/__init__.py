@@ -1,0 +1,1 @@
+"""Seeds to means, intervals, tests and verdicts."""

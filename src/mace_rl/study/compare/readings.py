@@ -1,0 +1,150 @@
+"""What decides the ranking: Table 1 under every reading of its two metrics (docs/metrics.md).
+
+Beside the runs as they are stand the same runs with their returns in random order. Whoever is first
+there is first by chance and by how returns are distributed, since nothing is learned in that order.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.runs.records import RunKey
+from mace_rl.study.claims_config import Table1Config
+from mace_rl.study.compare.statistics import logrank
+from mace_rl.study.compare.summary import summary
+from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.metrics_config import MetricsConfig
+
+PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"
+COLUMNS = ["env", "kind", "reading", "source", "variant", "mean", "low", "high", "seeds"]
+COLUMNS += ["censored", "rank", "p_value"]  # of readings.csv
+LEVEL = 0.05  # of the log-rank test that the first is really ahead
+
+
+def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metric]]:
+    """Every reading with the one of the paper's metrics that it reads, in the order of tables.
+
+    Only what counts episodes can be read in several ways.
+    """
+    found = [metric for metric in all_metrics(settings) if metric.unit == "episodes"]
+    return [
+        (kind, metric)
+        for kind in table1.metrics
+        for metric in found
+        if metric.name.startswith(kind)
+    ]
+
+
+def shuffled(
+    frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig
+) -> dict[RunKey, pd.DataFrame]:
+    """The same runs, the returns of each in random order."""
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    return {
+        run: frame.assign(extrinsic_return=generator.permutation(frame["extrinsic_return"]))
+        for run, frame in frames.items()
+    }
+
+
+def readings(
+    frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig, table1: Table1Config
+) -> pd.DataFrame:
+    """The data of readings.csv: one row per environment, reading, source and variant.
+
+    frames: the records (`read_episodes`) of each run (environment, variant, seed). Columns: env,
+    kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
+    variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
+    mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
+    """
+    found = kinds(settings, table1)
+    runs = {RUNS: metrics_table(frames, settings)}
+    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), settings)
+    means = {source: summary(table, settings, table1) for source, table in runs.items()}
+    parts = []
+    for environment in dict.fromkeys(name for name, _, _ in frames):
+        for kind in dict.fromkeys(kind for kind, _ in found):
+            parts.append(_published(environment, kind, list(frames), table1))
+        for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
+            if source == RUNS or metric.name in table1.shuffled:
+                table, own = means[source], runs[source]
+                rows = table[(table["env"] == environment) & (table["metric"] == metric.name)]
+                own = own[own["env"] == environment]
+                parts.append(
+                    _measured(rows, own, metric, settings).assign(kind=kind, source=source)
+                )
+    table = pd.concat(parts).rename(columns={"metric": "reading"})
+    return table[COLUMNS].reset_index(drop=True)
+
+
+def _published(
+    environment: str, kind: str, runs: Sequence[RunKey], table1: Table1Config
+) -> pd.DataFrame:
+    """The numbers of the paper's Table 1, of the variants that are there."""
+    variants = dict.fromkeys(variant for _, variant, _ in runs)
+    values = {
+        name: float(value)
+        for name in variants
+        if (value := table1.value(environment, name, kind)) is not None
+    }
+    rows = pd.DataFrame({"variant": list(values), "mean": list(values.values())})
+    rows = rows.assign(env=environment, kind=kind, metric=kind, source=PAPER, low=np.nan)
+    rows = rows.assign(high=np.nan, seeds=0, censored=0, p_value=np.nan)
+    return rows.assign(rank=rows["mean"].rank(method="min").astype(int))
+
+
+def _measured(
+    rows: pd.DataFrame, runs: pd.DataFrame, metric: Metric, settings: MetricsConfig
+) -> pd.DataFrame:
+    """The rows of one reading in a `summary`, with the rank and the test of each variant."""
+    variants = rows["variant"].to_list()
+    first = variants[int(rows["mean"].argmin())]
+    reached = {
+        str(name): np.where(own[metric.flag] == 1, np.inf, own[metric.name])
+        for name, own in runs.groupby("variant")
+    }
+    p_values = [
+        np.nan
+        if name == first
+        else logrank(
+            reached[first],
+            reached[name],
+            settings.bootstrap_repetitions,
+            np.random.default_rng(settings.bootstrap_seed),
+        )
+        for name in variants
+    ]
+    return rows.assign(rank=rows["mean"].rank(method="min").astype(int), p_value=p_values)
+
+
+def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str:
+    """A reading as a row of the table or the figure is called; `names` are the metrics' labels."""
+    if source == PAPER:
+        return f"{names[kind]}: the paper's Table 1"
+    if source == SHUFFLED:
+        return f"{names[reading]}, returns shuffled"
+    return names[reading]
+
+
+def in_order(
+    table: pd.DataFrame,
+) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
+    """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
+    found = [
+        ((str(kind), str(reading), str(source)), rows)
+        for (kind, reading, source), rows in table.groupby(
+            ["kind", "reading", "source"], sort=False
+        )
+    ]
+    order = list(table["kind"].unique()), [PAPER, RUNS, SHUFFLED]
+    return sorted(found, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
+
+
+def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
+    """The rows in the order of their means, and whether the first place is more than chance."""
+    ordered = rows.sort_values("mean", kind="stable")
+    others = ordered["p_value"].iloc[1:]
+    sure = others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1
+    return ordered, bool(sure)

@@ -1,0 +1,270 @@
+"""Statistics over seeds: estimates, intervals and comparisons.
+
+Pure functions of float64 arrays of shape [seeds]; whatever draws random numbers takes the generator
+that it draws them from. An interval is a pair (low, high), both NaN where one seed allows none.
+After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
+
+from mace_rl.study.metrics_config import MetricsConfig
+
+BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
+CHUNK = 2**20  # resampled values held in memory at a time
+BATCH = 1000  # resamples of a test at a time: faster than all 10000, which caches cannot hold
+
+
+class PairedComparison(NamedTuple):
+    """x - y over the seeds that both have."""
+
+    difference: np.ndarray  # mean of x - y, [] or [metrics] as the others
+    low: np.ndarray  # of the interval of the mean difference
+    high: np.ndarray
+    p_value: np.ndarray  # two-sided, of the sign-flip test; with n seeds ≥ 2 / 2ⁿ; NaN with one
+
+
+def interval_kind(seeds: int) -> str:
+    """Which interval `mean_interval` gives for this many seeds."""
+    return "t" if seeds < BOOTSTRAP_SEEDS else "bootstrap"
+
+
+def mean_interval(
+    values: np.ndarray, confidence: float, repetitions: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Interval of the mean over the first axis: Student's t below 10 seeds, else the bootstrap.
+
+    `values` are [seeds] or [seeds, points]; low and high are [] or [points], pointwise.
+    """
+    seeds, mean = len(values), np.mean(values, axis=0)
+    if seeds == 1:
+        return np.full_like(mean, np.nan), np.full_like(mean, np.nan)
+    if interval_kind(seeds) == "t":
+        error = np.std(values, axis=0, ddof=1) / np.sqrt(seeds)
+        half = scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2) * error
+        return mean - half, mean + half
+    drawn = draws(seeds, repetitions, generator)
+    flat = values.reshape(seeds, -1)  # [seeds, points]
+    points = max(1, CHUNK // repetitions)
+    bounds = [  # the same resampled seeds serve every point
+        percentiles(drawn @ flat[:, start : start + points] / seeds, confidence, seeds)
+        for start in range(0, flat.shape[1], points)
+    ]
+    low, high = np.concatenate(bounds, axis=1)
+    return low.reshape(mean.shape), high.reshape(mean.shape)
+
+
+def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, np.ndarray]:
+    """`mean_interval` as configured, from a generator of its own: none depends on another."""
+    generator = np.random.default_rng(settings.bootstrap_seed)
+    return mean_interval(values, settings.confidence, settings.bootstrap_repetitions, generator)
+
+
+def paired_comparison(
+    differences: np.ndarray,
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> PairedComparison:
+    """Compare x with y, of which `differences` are x - y by seed, [seeds] or [seeds, metrics].
+
+    The sign-flip test asks whether each sign of x - y was as likely as the other. It is exact while
+    2ⁿ ≤ `repetitions`, else of that many random sign patterns, the same for all metrics.
+    """
+    mean = np.mean(differences, axis=0)
+    low, high = mean_interval(differences, confidence, repetitions, generator)
+    if len(differences) == 1:
+        return PairedComparison(mean, low, high, np.full_like(mean, np.nan))
+    return PairedComparison(mean, low, high, _sign_flips(differences, repetitions, generator))
+
+
+def equivalence(
+    differences: Sequence[np.ndarray],
+    margin: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> float:
+    """p value that the mean over strata of the mean difference is not within ± `margin`.
+
+    Two one-sided sign-flip tests (Schuirmann 1987), that it is above -margin and that it is below
+    margin: the larger of their p values. differences: as of `stratified_comparison`. NaN with one
+    seed in a stratum.
+    """
+    if min(map(len, differences)) == 1:
+        return np.nan
+    above, below = (
+        _weighted([values - end for values in differences]) for end in (-margin, margin)
+    )
+    return max(
+        float(_sign_flips(above, repetitions, generator, "greater")),
+        float(_sign_flips(below, repetitions, generator, "less")),
+    )
+
+
+def _sign_flips(
+    values: np.ndarray,
+    repetitions: int,
+    generator: np.random.Generator,
+    alternative: str = "two-sided",
+) -> np.ndarray:
+    """p value of the sign-flip test of each mean over the first axis, exact where it can be."""
+    tested = scipy.stats.permutation_test(
+        (values,),
+        np.mean,
+        permutation_type="samples",
+        alternative=alternative,
+        n_resamples=repetitions,
+        batch=BATCH,
+        rng=generator,
+        vectorized=True,
+    )
+    return tested.pvalue
+
+
+def _weighted(differences: Sequence[np.ndarray]) -> np.ndarray:
+    """The differences of all strata, weighted: their mean is the mean of the strata's means."""
+    total = sum(len(values) for values in differences)
+    return np.concatenate(
+        [values * total / (len(differences) * len(values)) for values in differences]
+    )
+
+
+def stratified_comparison(
+    differences: Sequence[np.ndarray],
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> PairedComparison:
+    """The mean over strata (environments) of the mean paired difference, [seeds] in each.
+
+    The bootstrap resamples, and the sign-flip test flips, within the strata. With fewer than 10
+    seeds in one of them the interval is Student's t with the degrees of freedom of the smallest.
+    With one stratum: `paired_comparison`.
+    """
+    if len(differences) == 1:
+        return paired_comparison(differences[0], confidence, repetitions, generator)
+    tested = paired_comparison(_weighted(differences), confidence, repetitions, generator)
+    smallest = min(len(values) for values in differences)
+    if smallest == 1:
+        return tested._replace(low=np.array(np.nan), high=np.array(np.nan))
+    if interval_kind(smallest) == "t":
+        errors = [np.var(values, ddof=1) / len(values) for values in differences]
+        error = np.sqrt(np.sum(errors)) / len(differences)
+        half = scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error
+        return tested._replace(low=tested.difference - half, high=tested.difference + half)
+    means = [
+        draws(len(values), repetitions, generator) @ values / len(values) for values in differences
+    ]
+    low, high = percentiles(np.mean(means, axis=0), confidence, smallest)
+    return tested._replace(low=low, high=high)
+
+
+def logrank(
+    x: np.ndarray,
+    y: np.ndarray,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> float:
+    """Two-sided p value of the log-rank test that x [n] and y [m] come from the same distribution.
+
+    Episodes at which something was reached, np.inf where it never was (censored at the end of
+    training). From the permutation distribution of observed minus expected events: exact while
+    there are ≤ `repetitions` ways to choose n of n + m, else of that many random ones. (The usual
+    normal approximation gives 0.025 for three runs all later than three others; it is 0.1.) NaN
+    with one run of each.
+    """
+    times, reached = np.concatenate([x, y]), np.isfinite(np.concatenate([x, y]))
+    if len(times) == 2:
+        return np.nan
+    at_risk = np.sum(times[:, None] <= times, axis=1)  # [n + m]: those that are not earlier
+    expected = (times[:, None] >= times) @ (reached / at_risk)
+    scores = reached - expected
+
+    def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return np.round(np.mean(x, axis=axis) - np.mean(y, axis=axis), 12)  # ties
+
+    if scipy.special.comb(len(times), len(x)) <= repetitions:
+        tested = scipy.stats.permutation_test(
+            (scores[: len(x)], scores[len(x) :]),
+            statistic,
+            n_resamples=repetitions,
+            batch=BATCH,
+            vectorized=True,
+        )
+    else:  # which `permutation_test` would draw one by one
+        tested = scipy.stats.monte_carlo_test(
+            scores,
+            lambda size: generator.permuted(np.broadcast_to(scores, size), axis=-1),
+            lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
+            n_resamples=repetitions,
+            batch=BATCH,
+            vectorized=True,
+        )
+    return float(tested.pvalue)
+
+
+def probability_of_improvement(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """P(X > Y) + P(X = Y) / 2 for one run of each, and the bounds of its bootstrap interval.
+
+    Each is [metrics], the mean over `pairs` (x [n, metrics], y [m, metrics]), one for each
+    environment. All x and y are unpaired and resampled independently; the same draws serve every
+    metric. *Greater* is the improvement: pass the negative of a metric of which lower is better.
+    """
+    metrics = pairs[0][0].shape[1]
+    means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
+    for x, y in pairs:
+        wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m, metrics]
+        drawn_x, drawn_y = (draws(len(runs), repetitions, generator) for runs in (x, y))
+        means += wins.mean(axis=(0, 1)) / len(pairs)
+        for metric in range(metrics):
+            won = np.sum((drawn_x @ wins[:, :, metric]) * drawn_y, axis=1)
+            resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
+    fewest = min(len(runs) for both in pairs for runs in both)
+    low, high = percentiles(resampled, confidence, fewest)
+    return means, low, high
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """Holm's (1979) adjusted p values, in the given order: reject where one is ≤ the level.
+
+    The k-th smallest of m is multiplied by m - k + 1 and is never less than those before it.
+    """
+    p = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(p)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    return np.minimum(adjusted, 1)
+
+
+def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.ndarray:
+    """How often each of `count` values is in each bootstrap sample of that size.
+
+    As float64 [repetitions, count]: `draws @ values / count` are the means of the samples.
+    """
+    drawn = generator.integers(count, size=(repetitions, count))
+    drawn += count * np.arange(repetitions)[:, None]  # each sample has a range of its own
+    times = np.bincount(drawn.ravel(), minlength=repetitions * count)
+    return times.reshape(repetitions, count).astype(np.float64)
+
+
+def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
+    """The bounds [2, …] of a bootstrap interval from `estimates` [repetitions, …], used up by it.
+
+    The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
+    the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
+    a bootstrap over 10 seeds is too narrow otherwise (docs/metrics.md). With one seed, and
+    where one of `estimates` is NaN, NaN.
+    """
+    if seeds == 1:
+        return np.full((2, *estimates.shape[1:]), np.nan)
+    wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
+    tail = 100 * scipy.special.ndtr(-wider)
+    return np.percentile(estimates, [tail, 100 - tail], axis=0, overwrite_input=True)

@@ -1,0 +1,307 @@
+"""What is measured on one run: how well it ends, and how soon it gets there (docs/metrics.md).
+
+`METRICS` is the table of it, and columns, tables and comparisons follow it. A metric is a pure
+function of a `LearningCurve`; further ones, outside of this package, are added by the configuration
+(`metrics.custom`). An metric in episodes that a run never attains is reported as E and flagged as
+censored, never dropped; E is then a lower bound.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy  # loads what is used of it when it is
+
+from mace_rl.config.plugins import load
+from mace_rl.config.section import ConfigError
+from mace_rl.study.metrics_config import MetricsConfig
+
+PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
+PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
+PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
+
+CORRELATION = "stagnation_correlation"  # of betas.csv, beside the metrics: `METRICS`
+COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
+
+
+class Attained(NamedTuple):
+    """The episode (from 1) at which something is attained; E and censored if it never is."""
+
+    number: int
+    censored: bool
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """What a metric sees of one run."""
+
+    returns: np.ndarray  # float64 [E], the extrinsic return of each training episode
+    final: float  # `final_return` of these
+    random_mean: float  # mean return of uniformly random actions in this environment
+    settings: MetricsConfig
+    reference: float = math.nan  # `reference_return` and `solved_return` in this environment,
+    solved: float = math.nan  # where the study has them
+
+    @cached_property
+    def learned(self) -> bool:
+        """Whether the run ends better than random actions, by more than two standard errors.
+
+        If not, a bar that depends on how it ends says nothing: 75 % of 0 is reached in episode 1.
+        """
+        last = last_part(self.returns, self.settings.final_fraction)
+        return bool(self.final - 2 * last.std() / math.sqrt(len(last)) > self.random_mean)
+
+    @cached_property
+    def average(self) -> np.ndarray:
+        """The `moving_average`, [E - window + 1]."""
+        return moving_average(self.returns, self.settings.moving_average)
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Its `slope`, [E - 2 · window + 1]."""
+        return slope(self.returns, self.settings.moving_average)
+
+    def bar(self, goal: float) -> float:
+        """The return threshold of the way from random actions to `goal`."""
+        return self.random_mean + self.settings.threshold * (goal - self.random_mean)
+
+    def first(self, reached: np.ndarray, episode: int = 1) -> Attained:
+        """The first true entry of `reached` [n], whose entry 0 belongs to episode `episode`."""
+        if not reached.any():
+            return Attained(len(self.returns), True)
+        return Attained(episode + int(np.argmax(reached)), False)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One thing measured on each run."""
+
+    name: str  # of its column in metrics.csv
+    label: str  # in tables
+    unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
+    function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
+    needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
+
+    @property
+    def flag(self) -> str:
+        """The column that tells which episodes are censored."""
+        return f"{self.name}_censored"
+
+
+def last_part(returns: np.ndarray, fraction: float) -> np.ndarray:
+    """The last `fraction` of the episodes (paper: the last 10 %).
+
+    Where that is no whole number of episodes it is rounded up: 15 episodes end with the last 2.
+    """
+    last = math.ceil(Fraction(repr(fraction)) * len(returns))  # 0.07 of 100 is 7, not 7.000…001
+    return returns[-last:]
+
+
+def final_return(returns: np.ndarray, fraction: float) -> float:
+    """Mean return of `last_part`."""
+    return float(np.mean(last_part(returns, fraction)))
+
+
+def moving_average(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of each `window` consecutive values, [E - window + 1]; empty if E < window.
+
+    Entry i is the average after episode `window` + i.
+    """
+    return _moving_sum(values, window) / window
+
+
+def slope(returns: np.ndarray, window: int) -> np.ndarray:
+    """Slope of the moving average in return per episode, [E - 2 · window + 1] or empty.
+
+    Entry i belongs to episode 2 · `window` + i and compares the last `window` episodes with the
+    `window` before them. (From one episode to the next, a moving average changes by the difference
+    of two single episodes: that slope is noise, and 0 wherever two returns happen to be equal.)
+    """
+    total = _moving_sum(returns, window)
+    return (total[window:] - total[:-window]) / window**2
+
+
+def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
+    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
+
+    returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
+    2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
+    """
+    stagnation, following = -slope(returns, window)[:-1], betas[2 * window :]
+    if len(following) < 2 or np.ptp(stagnation) == 0 or np.ptp(following) == 0:
+        return 0.0
+    return float(scipy.stats.spearmanr(stagnation, following).statistic)
+
+
+def sample_efficiency(curve: LearningCurve) -> Attained:
+    """The first episode with a return ≥ threshold · final (paper, literally).
+
+    A single lucky episode is enough. Where returns are negative the bar lies *above* the final
+    return (75 % of -85 is -63.75) and may never be reached. Censored too, and this the paper does
+    not say: the run has not `learned`.
+    """
+    reached = curve.returns >= curve.settings.threshold * curve.final
+    return curve.first(reached & curve.learned)
+
+
+def convergence_steps(curve: LearningCurve) -> Attained:
+    """The point where the slope of the moving average becomes minimal (paper).
+
+    Our reading: the first episode, once the average has come threshold of the way from random to
+    final, at which its slope is down to `convergence_slope` of the steepest so far. It is steady
+    from seed to seed and sees a delay (simulated: docs/metrics.md).
+
+    Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
+    """
+    settings, window = curve.settings, curve.settings.moving_average
+    high = curve.average >= curve.bar(curve.final)
+    learned = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
+    steepest = np.maximum.accumulate(curve.slopes)
+    minimal = curve.slopes <= settings.convergence_slope * steepest
+    return curve.first(learned & minimal & curve.learned, 2 * window)
+
+
+def convergence_steps_steepest(curve: LearningCurve) -> Attained:
+    """The first episode after the steepest rise at which the slope is no longer positive.
+
+    The steepest rise can be the recovery from a late collapse. Censored: the average never rises,
+    is still rising at the end, the run has not `learned`, or E < 2 windows.
+    """
+    window, slopes = curve.settings.moving_average, curve.slopes
+    if not (slopes > 0).any():
+        return Attained(len(curve.returns), True)
+    steepest = int(np.argmax(slopes))  # the first of equals
+    return curve.first((slopes[steepest:] <= 0) & curve.learned, 2 * window + steepest)
+
+
+def convergence_steps_flattest(curve: LearningCurve) -> Attained:
+    """The first episode at which the absolute slope is smallest in all of training.
+
+    The most literal reading of the paper's sentence: it finds the flat start of a run that has yet
+    to learn, or chance on the final plateau. Censored: the run has not `learned`, or E < 2 windows.
+    """
+    magnitude = np.abs(curve.slopes)
+    flattest = magnitude == magnitude.min(initial=np.inf)
+    return curve.first(flattest & curve.learned, 2 * curve.settings.moving_average)
+
+
+def convergence_steps_public_code(curve: LearningCurve) -> Attained:
+    """The rule of the authors' public code, whatever the window configured here.
+
+    The first 50-episode window past 30 % of training after which the moving average changes by less
+    than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
+    first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learned.
+    """
+    floor = int(PUBLIC_CODE_FLOOR * (len(curve.returns) - PUBLIC_CODE_WINDOW + 1))
+    flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[floor:]) < PUBLIC_CODE_SLOPE
+    return curve.first(flat, floor + 1)
+
+
+def sample_efficiency_common(curve: LearningCurve) -> Attained:
+    """The first episode whose moving average has come threshold of the way to the reference.
+
+    The bar is random + threshold · (reference - random), the same for every variant: ending worse
+    does not lower it. Censored: never reached.
+    """
+    return _average_reaches(curve, curve.reference)
+
+
+def sample_efficiency_range(curve: LearningCurve) -> Attained:
+    """The first episode whose moving average has come threshold of the way from random to final.
+
+    The bar is random + threshold · (final - random): it means the same for negative returns, and
+    one lucky episode does not reach it. Censored: the run has not `learned`.
+    """
+    reached = _average_reaches(curve, curve.final)
+    return reached if curve.learned else Attained(len(curve.returns), True)
+
+
+def convergence_steps_range(curve: LearningCurve) -> Attained:
+    """The first episode from which on the moving average stays near the final return.
+
+    Near is within band · (final - random). Censored: the average ends outside that band, or the
+    run has not `learned`.
+    """
+    settings, gain = curve.settings, curve.final - curve.random_mean
+    near = np.abs(curve.average - curve.final) <= settings.convergence_band * gain
+    settled = np.logical_and.accumulate(near[::-1])[::-1]
+    return curve.first(settled & curve.learned, settings.moving_average)
+
+
+def early_return(curve: LearningCurve) -> float:
+    """Mean return of the first episodes, as many as `last_part` has: how steep the curve begins."""
+    count = len(last_part(curve.returns, curve.settings.final_fraction))
+    return float(np.mean(curve.returns[:count]))
+
+
+def solved(curve: LearningCurve) -> float:
+    """The share of the last episodes (`last_part`) whose return is at least `solved_return`."""
+    return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
+
+
+def _episodes(function: Callable[[LearningCurve], Attained], label: str, *needs: str) -> Metric:
+    return Metric(function.__name__, label, "episodes", function, *needs)
+
+
+METRICS = (  # the area is under the learning curve, per episode
+    Metric("final_return", "Final return", "return", lambda curve: curve.final),
+    _episodes(sample_efficiency, "Sample efficiency"),
+    _episodes(convergence_steps, "Convergence"),
+    Metric("area_under_curve", "Mean return of training", "return", lambda c: c.returns.mean()),
+    Metric("early_return", "Mean return of the beginning", "return", early_return),
+    Metric("solved", "Solved at the end", "share", solved, "solved_return"),
+    _episodes(sample_efficiency_common, "Sample efficiency (common bar)", "reference_return"),
+    _episodes(sample_efficiency_range, "Sample efficiency (range)"),
+    _episodes(convergence_steps_range, "Convergence (range)"),
+    _episodes(convergence_steps_steepest, "Convergence (steepest)"),
+    _episodes(convergence_steps_flattest, "Convergence (flattest)"),
+    _episodes(convergence_steps_public_code, "Convergence (public code)"),
+)
+
+
+def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
+    """Those of `METRICS` whose settings are there and, after them, those of `metrics.custom`.
+
+    Raises `ConfigError` for what is no metric.
+    """
+    metrics = [one for one in METRICS if one.needs is None or getattr(settings, one.needs)]
+    for reference in settings.custom:
+        metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
+        if not isinstance(metric, Metric):
+            problem = f"is no {__name__}.Metric but of type {type(metric).__name__}"
+        elif not metric.name.isidentifier():
+            problem = f"has the name {metric.name!r}, but a column's name should be a word"
+        elif {metric.name, metric.flag} & columns.keys():
+            problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
+        elif metric.unit not in COLUMN_TYPES:
+            problem = (
+                f"has the unit {metric.unit!r}, but should have one of {', '.join(COLUMN_TYPES)}"
+            )
+        else:
+            metrics.append(metric)
+            continue
+        raise ConfigError(f"metrics.custom has {reference!r}, which {problem}")
+    return tuple(metrics)
+
+
+def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
+    """The columns of metrics.csv, one row per run, with these metrics."""
+    run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}
+    values = {metric.name: COLUMN_TYPES[metric.unit] for metric in metrics}
+    return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
+
+
+def _average_reaches(curve: LearningCurve, goal: float) -> Attained:
+    """The first episode whose moving average is at the bar for `goal`."""
+    return curve.first(curve.average >= curve.bar(goal), curve.settings.moving_average)
+
+
+def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:
+    """Sum of each `window` consecutive values: exact for whole numbers, so that ties are ties."""
+    if len(values) < window:
+        return np.empty(0)
+    return np.lib.stride_tricks.sliding_window_view(values, window).sum(axis=-1)

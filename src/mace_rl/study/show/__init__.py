@@ -1,0 +1,1 @@
+"""Data to tables, pages and pictures."""

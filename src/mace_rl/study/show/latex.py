@@ -1,0 +1,175 @@
+"""The paper's Table 1 and Table 2 as LaTeX to \\input: captions, tabulars and cells."""
+
+from collections.abc import Mapping
+
+import pandas as pd
+
+from mace_rl.config.agent import PPOConfig
+from mace_rl.study.claims_config import Table1Config, Table2Config
+from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
+from mace_rl.study.compare.summary import from_to
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import tables
+from mace_rl.study.show.cells import COLUMNS_PER_BLOCK, DASH, Cell
+
+INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
+
+_LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"<": "$<$", ">": "$>$", "|": "$|$", "±": r"$\pm$", "\u00d7": r"$\times$", "−": "$-$"}
+    | {"\u2013": "--", "\u2014": "---", "₀": "$_0$", "≤": r"$\leq$", "≥": r"$\geq$"}
+    | {"\u03b1": r"$\alpha$", "β": r"$\beta$", "\u03b3": r"$\gamma$", "δ": r"$\delta$"}
+    | {"ε": r"$\epsilon$", "ϵ": r"$\epsilon$", "η": r"$\eta$", "θ": r"$\theta$"}
+    | {"λ": r"$\lambda$", "μ": r"$\mu$", "\u03c3": r"$\sigma$", "τ": r"$\tau$"}
+    | {"\U0001d43e": "$K$", "⁻": "$^-$"}
+    | {power: f"$^{digit}$" for digit, power in enumerate("⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹")}
+)
+
+
+def table1_latex(
+    table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig, paper: Table1Config
+) -> str:
+    """Table 1 in the paper's layout from the data of table1.csv."""
+    what = escaped(paper.caption)
+    if tables.counts_episodes(settings, paper):
+        both = " for both" if len(paper.metrics) == 2 else ""
+        what += (
+            f", in training episodes. Lower is better{both}; the lowest mean is \\textbf{{bold}}. "
+        )
+    else:
+        what += r". The best mean is \textbf{bold}. "
+    frame = tables.table1(tables.named(table, labels), settings, paper)
+    return latex_float(what + _how(table, settings.confidence), "tab:table1", frame)
+
+
+def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
+    """Table 2, the PPO hyperparameters: the paper's rows, a line, and this project's."""
+    rows = [
+        f"\\raggedright {escaped(name)} & {latex_cell(value)} \\\\"
+        for name, value in tables.table2(ppo, paper).to_numpy()
+    ]
+    end = len(paper.rows) + 1  # and Adam
+    lines = [
+        r"\begin{table}[tbp]",
+        r"\centering",
+        r"\caption{PPO hyperparameters: those of the paper, and below the line those that it leaves"
+        " open.}",
+        r"\label{tab:table2}",
+        r"\par\medskip",
+        r"\footnotesize",
+        r"\begin{tabular}{@{}p{0.42\linewidth}l@{}}",
+        r"\toprule",
+        r"Hyperparameter & Value \\",
+        r"\midrule",
+        *rows[:end],
+        r"\midrule",
+        *rows[end:],
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _how(table: pd.DataFrame, confidence: float) -> str:
+    """The part of a caption that says from what the numbers come."""
+    seeds = sorted(table["seeds"].unique())
+    budgets: dict[str, list[str]] = {}
+    for environment, group in table.groupby("env", sort=False):
+        budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
+        budgets.setdefault(budget, []).append(str(environment))
+    budget = "; ".join(
+        f"{episodes} episodes ({escaped(', '.join(environments))})"
+        for episodes, environments in budgets.items()
+    )
+    level = escaped(f"{100 * confidence:g}")
+    kinds = dict.fromkeys(INTERVALS[interval_kind(count)] for count in seeds if count > 1)
+    if kinds:
+        kind = f" (below {BOOTSTRAP_SEEDS} seeds) or ".join(kinds)
+        none = "; one seed allows none" if seeds[0] == 1 else ""
+        text = (
+            f"Means over {from_to(table['seeds'])} seeds and, below,"
+            f" their {level}\\,\\% {kind} intervals{none}."
+        )
+    else:
+        text = "One seed, which allows no interval."
+    text += f" Training budget: {budget}."
+    if table["censored"].any():
+        text += rf" $^{{\dagger k}}$: $k$ {tables.CENSORED}, a lower bound."
+    return text
+
+
+def escaped(text: str) -> str:
+    """`text` with LaTeX's special characters escaped and symbols such as β in math mode."""
+    return text.translate(_LATEX)
+
+
+def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
+    """A table for \\input, as wide as the page; it needs the package booktabs and nothing else.
+
+    The columns beyond `COLUMNS_PER_BLOCK` go into tabulars below.
+    """
+    head, *names = frame.columns
+    starts = range(0, len(names), COLUMNS_PER_BLOCK)
+    blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
+    lines = [
+        r"\begin{table*}[tbp]",
+        r"\centering",
+        rf"\caption{{{caption}}}",
+        rf"\label{{{label}}}",
+        r"\par\medskip",
+        r"\footnotesize",
+        r"\setlength{\tabcolsep}{2pt}",
+        "\n\\par\\medskip\n".join(_tabular(frame[[head, *block]]) for block in blocks),
+        r"\end{table*}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _tabular(frame: pd.DataFrame) -> str:
+    """A tabular of \\textwidth."""
+    columns = r"p{0.23\textwidth}" + "c" * (len(frame.columns) - 1)
+    names = [lines[0] if len(lines) == 1 else stack(*lines) for lines in map(_name, frame.columns)]
+    rows = [
+        [r"\newline ".join(_name(name)), *map(latex_cell, cells)]
+        for name, *cells in frame.to_numpy()
+    ]
+    lines = [
+        rf"\begin{{tabular*}}{{\textwidth}}{{@{{\extracolsep{{\fill}}}}{columns}@{{}}}}",
+        r"\toprule",
+        " & ".join(names) + r" \\",
+        r"\midrule",
+        "\n\\addlinespace\n".join(rf"\raggedright {' & '.join(row)} \\" for row in rows),
+        r"\bottomrule",
+        r"\end{tabular*}",
+    ]
+    return "\n".join(lines)
+
+
+def latex_cell(cell: str | Cell) -> str:
+    """A cell: its values, and their intervals below."""
+    if isinstance(cell, str):
+        return escaped(cell)
+    texts = []
+    for one in cell.values:
+        text = rf"\textbf{{{escaped(one.text)}}}" if one.best else escaped(one.text)
+        dagger = one.mark.replace("†", r"\dagger")
+        texts.append(text + (f"$^{{{dagger}}}$" if dagger else ""))
+    if not any(one.low for one in cell.values):
+        return stack(*texts, align="l")
+    ends = (
+        "--" if one.low == DASH else rf"[{escaped(one.low)},\,{escaped(one.high)}]"
+        for one in cell.values
+    )
+    return stack(cell.joint.join(texts), rf"{{\scriptsize {'/'.join(ends)}}}")
+
+
+def stack(*lines: str, align: str = "c") -> str:
+    """Lines of LaTeX below one another in one cell."""
+    return rf"\begin{{tabular}}[t]{{@{{}}{align}@{{}}}}" + r"\\".join(lines) + r"\end{tabular}"
+
+
+def _name(name: str) -> list[str]:
+    """A variant's name in LaTeX, what is in parentheses on a line of its own."""
+    return escaped(name).replace(" (", "\n(", 1).split("\n")

@@ -1,0 +1,163 @@
+"""The sections of a study, each a title, a note and a table: what its pages are made of.
+
+claims.md and tables.md have them as they are; the report has the same under its pictures.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from mace_rl.runs.records import read_table
+from mace_rl.study.claims_config import ClaimsConfig
+from mace_rl.study.compare.comparisons import ALL
+from mace_rl.study.compare.ledger import Answer, read_ledger
+from mace_rl.study.compare.summary import from_to
+from mace_rl.study.compare.verdicts import POWER
+from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import tables
+
+TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
+RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
+PARTS = (
+    "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
+    " *p*: of no difference; *p within*: of one beyond the margin; both corrected for all"
+    " parts. *P*: that a run of the first is better. *Margin*: what is worth mentioning."
+    f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
+    " correction."
+)
+
+Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
+
+
+class Section(NamedTuple):
+    """A table and what is to be said of it; in the note, words between asterisks are italic."""
+
+    title: str
+    note: str
+    frame: pd.DataFrame
+    level: int = 2
+
+
+def read_data(
+    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> tuple[dict[str, pd.DataFrame], list[Answer]]:
+    """The data of these runs, and the ledger, empty without one, from files by their names."""
+    # Names are as they were given, NA and 0.1 too; an empty cell is NaN.
+    how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
+    files = {name: path for name, path in found.items() if str(path).endswith(".csv")}
+    data = {name: pd.read_csv(path, **how) for name, path in files.items()}
+    data["metrics"] = read_metrics(found["metrics"], runs, settings)
+    if "betas" in found:
+        data["betas"] = read_table(found["betas"], BETAS)
+    return data, read_ledger(found["ledger"]) if "ledger" in found else []
+
+
+def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
+    """The answers of each family that has been asked."""
+    titles = dict.fromkeys(answer.family for answer in answers)
+    return {title: [one for one in answers if one.family == title] for title in titles}
+
+
+def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
+    """How many claims of one family have which verdict, in words."""
+    counts = Counter(answer.ways[how].verdict for answer in answers)
+    words = claims.families[answers[0].family].words.model_dump().values()
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
+
+
+def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
+    """Family by family the verdicts, and then the parts in each way to measure them."""
+    for title, own in by_family(answers).items():
+        verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/protocol.md."
+        yield Section(title.capitalize(), note, tables.verdicts(own))
+        for how in own[0].ways:
+            frame = tables.parts(own, how, {})
+            yield Section(f"Part by part: {how}", PARTS, frame, level=3)
+
+
+def of_runs(
+    data: Data, claims: ClaimsConfig, settings: MetricsConfig, names: Mapping[str, str]
+) -> list[Section]:
+    """Everything but the ledger, with these names of the variants.
+
+    data: frames by the name of their CSV file: metrics, betas, table1, supplement, comparisons,
+    aggregate and, where the study has them, readings.
+    """
+    data = {name: tables.named(frame, names) for name, frame in data.items()}
+    return [
+        *_means(data, claims, settings),
+        *_compared(data, settings),
+        *_others(data, settings),
+        *_companions(data, settings),
+    ]
+
+
+def _means(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> Iterator[Section]:
+    """What each variant reached in each environment."""
+    runs, supplement, paper = data["metrics"], data["supplement"], claims.table1
+    interval = f"{100 * settings.confidence:g} % interval"
+    seeds = from_to(runs.groupby(["env", "variant"]).size())
+    for metric, title in RETURNS.items():
+        if metric not in paper.metrics:
+            frame = tables.means(supplement, metric, settings)
+            yield Section(title, f"Mean over {seeds} seeds ({interval}).", frame)
+    yield Section("Final return of the worst seed", "", tables.worst(runs, settings))
+    if "solved" in runs:
+        note = f"Seeds whose last episodes are solved in {tables.SOLVED:.0%} of the cases or more."
+        yield Section("Seeds that solve", note, tables.solved(runs))
+    note = f"{paper.caption}: mean over seeds ({interval}), the best bold."
+    if tables.counts_episodes(settings, paper):
+        note = (
+            f"{paper.caption} in episodes, lower is better: mean over seeds ({interval}), the"
+            f" lowest bold. †k: k {tables.CENSORED}, so the mean is a lower bound."
+        )
+    yield Section("Table 1", note, tables.table1(data["table1"], settings, paper))
+
+
+def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
+    """One variant against another."""
+    table, means = data["comparisons"], pd.concat([data["table1"], data["supplement"]])
+    for metric, title in RETURNS.items() if len(table) else ():
+        note = "P: that a run of the first is better than one of the second; 0.5 is a coin's toss."
+        yield Section(f"{title}: who is better", note, tables.improvement(table, metric))
+        note = (
+            "Difference: mean over the seeds that both have (interval). p: of the sign-flip test,"
+            " by itself and corrected for all metrics, pairs and environments (comparisons.csv);"
+            " verdicts have a correction of their own."
+        )
+        own = table[(table["metric"] == metric) & (table["env"] != ALL)]
+        frame = tables.comparisons(own, means, settings)
+        yield Section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
+
+
+def _others(data: Data, settings: MetricsConfig) -> Iterator[Section]:
+    """All environments together, readings and β."""
+    if data["metrics"]["env"].nunique() > 1:
+        note = "Scores: 0 is the random policy, 1 the study's best run."
+        yield Section("All environments together", note, tables.aggregate(data["aggregate"]))
+    if "readings" in data:
+        note = (
+            "Means in episodes, the lowest first; bold if a log-rank test against each of the"
+            " others has p < 0.05, not corrected. †: some runs never got there."
+        )
+        frame = tables.readings(data["readings"], settings)
+        yield Section("What decides the ranking", note, frame)
+    frame = tables.betas(data["betas"], settings)
+    if len(frame):
+        note = (
+            "Where β is not the same in every seed: of all seeds the least, the median and the"
+            " most. With stagnation: mean over seeds of its rank correlation with the stagnation"
+            " before (C9)."
+        )
+        yield Section("β", note, frame)
+
+
+def _companions(data: Data, settings: MetricsConfig) -> Iterator[Section]:
+    """Every metric but Table 1's, environment by environment."""
+    note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
+    for environment, frame in tables.companions(data["supplement"], settings).items():
+        yield Section(f"The other metrics: {environment}", note, frame)

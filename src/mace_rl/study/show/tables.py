@@ -1,0 +1,357 @@
+"""Every table of a study, as a frame of cells.
+
+A frame of cells has a table's heads as columns and what is printed as values: words (`str`) and
+`Cell`s. `markdown`, `report` and `latex` print it. Variants are called what they are called
+in the data: `named` gives them other names first.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
+from mace_rl.runs.progress import duration
+from mace_rl.study.claims_config import Table1Config, Table2Config
+from mace_rl.study.compare.ledger import Answer
+from mace_rl.study.compare.readings import in_order, ranked, title
+from mace_rl.study.compare.statistics import interval
+from mace_rl.study.compare.summary import digits_by_metric
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show.cells import Cell, Value, estimate, number
+
+CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
+POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
+SOLVED = 0.9  # of the last episodes, for a seed to count
+
+
+def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
+    """A study's data with other names of its variants."""
+    columns = table.columns.intersection(["variant", "baseline"])
+    return table.assign(**{column: table[column].replace(dict(names)) for column in columns})
+
+
+def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) -> pd.DataFrame:
+    """Table 1 in the paper's layout, of the data of table1.csv: its metrics side by side.
+
+    Rows are variants, columns environments. The best mean of each environment and metric is bold,
+    as displayed; ties all are, and a mean of seeds that all never got there is not. The paper's
+    numbers stand beside.
+    """
+    digits, units = (
+        digits_by_metric(table, settings),
+        {metric.name: metric.unit for metric in all_metrics(settings)},
+    )
+    best = {}
+    attained = table[table["censored"] < table["seeds"]]
+    for (env, metric), group in attained.groupby(["env", "metric"]):
+        key = str(env), str(metric)
+        first = group["mean"].min() if units[key[1]] == "episodes" else group["mean"].max()
+        best[key] = number(first, digits[key])
+
+    def mean(row: pd.Series) -> Value:
+        key = row["env"], row["metric"]
+        some = row["censored"] < row["seeds"]
+        return _mean(row, digits[key], some and number(row["mean"], digits[key]) == best[key])
+
+    def cell(runs: pd.DataFrame) -> Cell:
+        rows = [runs[runs["metric"] == metric].iloc[0] for metric in paper.metrics]
+        published = [
+            number(row["paper"], digits[row["env"], row["metric"]])
+            for row in rows
+            if not pd.isna(row["paper"])
+        ]
+        note = f"paper: {' / '.join(published)}" if published else ""
+        return Cell([mean(row) for row in rows], note=note)
+
+    return _grid(table, cell, "Algorithm")
+
+
+def counts_episodes(settings: MetricsConfig, paper: Table1Config) -> bool:
+    """Whether all metrics of Table 1 do, of which fewer are better."""
+    units = {metric.name: metric.unit for metric in all_metrics(settings)}
+    return all(units[metric] == "episodes" for metric in paper.metrics)
+
+
+def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.DataFrame]:
+    """By environment, a row for each metric of a `summary` and a column for each variant."""
+    digits = digits_by_metric(table, settings)
+    labelled = table.assign(label=table["metric"].map(_labels(settings)))
+    return {
+        str(environment): _grid(
+            own,
+            lambda rows: Cell(
+                [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
+            ),
+            rows="label",
+            columns="variant",
+        )
+        for environment, own in labelled.groupby("env", sort=False)
+    }
+
+
+def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
+    """One metric of a `summary`, a row for each variant and a column for each environment."""
+    digits, own = digits_by_metric(table, settings), table[table["metric"] == metric]
+    return _grid(own, lambda rows: Cell([_mean(rows.iloc[0], digits[rows["env"].iloc[0], metric])]))
+
+
+def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The final return of each variant's worst seed, from the frame of metrics.csv."""
+    returns = runs.assign(metric="final_return", mean=runs["final_return"])
+    digits = digits_by_metric(returns, settings)
+    return _grid(
+        returns, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0], "final_return"])
+    )
+
+
+def solved(runs: pd.DataFrame) -> pd.DataFrame:
+    """How many seeds solve each task, from the frame of metrics.csv."""
+    return _grid(runs, lambda own: f"{int((own['solved'] >= SOLVED).sum())} of {len(own)}")
+
+
+def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
+    digits, labels = digits_by_metric(means, settings), _labels(settings)
+    return _rows(
+        table,
+        {
+            "environment": lambda row: row["env"],
+            "metric": lambda row: labels[row["metric"]],
+            "": lambda row: f"{row['variant']} over {row['baseline']}",
+            "n": lambda row: _number(row["seeds"]),
+            # All environments together have no digits, and no values that would need them.
+            "difference": lambda row: _estimate(
+                row, "difference", digits.get((row["env"], row["metric"]), 0), ends=""
+            ),
+            "p": lambda row: _number(row["p_value"], 4),
+            "p (Holm)": lambda row: _number(row["p_holm"], 4),
+            "P": lambda row: _estimate(row, "probability", 2),
+        },
+    )
+
+
+def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """The probabilities of comparisons.csv: a row for each pair, a column for each environment."""
+    own = table.assign(pair=table["variant"] + " over " + table["baseline"])
+    own = own[own["metric"] == metric]
+    return _grid(own, lambda rows: _estimate(rows.iloc[0], "probability", 2), rows="pair")
+
+
+def aggregate(table: pd.DataFrame) -> pd.DataFrame:
+    """aggregate.csv."""
+    return _rows(
+        table,
+        {
+            "": lambda row: row["variant"],
+            "score of": lambda row: row["metric"].replace("_", " "),
+            "runs": lambda row: _number(row["runs"]),
+            "mean": lambda row: _estimate(row, "mean", 3),
+            "interquartile mean": lambda row: _estimate(row, "iqm", 3),
+        },
+    )
+
+
+def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """Of each reading (`readings.csv`) and environment the variants, the first one first.
+
+    The best is a first place that the log-rank test against each of the others does not put down to
+    chance (p < 0.05, not corrected for the many readings); † means that some of the runs never got
+    there.
+    """
+
+    def cell(rows: pd.DataFrame) -> Cell:
+        ordered, is_first = ranked(rows)
+        values = [
+            Value(f"{row['variant']} {number(row['mean'])}", mark="†" if row["censored"] else "")
+            for _, row in ordered.iterrows()
+        ]
+        return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
+
+    parts = [own.assign(title=title(*key, _labels(settings))) for key, own in in_order(table)]
+    frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
+    return frame[["episodes", *table["env"].unique()]]
+
+
+def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """betas.csv: the variants whose β is not the same in every seed, and how it ended."""
+    rows = []
+    for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
+        if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
+            continue
+        found = runs["stagnation_correlation"].to_numpy()
+        low, high = interval(found, settings)
+        seeds = (
+            ", ".join(number(beta, 2) for beta in runs[name].quantile([0, 0.5, 1]))
+            for name in ("beta_end", "beta_lowest")
+        )
+        correlation = Cell([estimate(found.mean(), float(low), float(high), 3)])
+        rows.append([environment, variant, _number(len(runs)), *seeds, correlation])
+    heads = ["environment", "", "n", "β at the end", "lowest β", "with stagnation"]
+    return pd.DataFrame(rows, columns=heads)
+
+
+def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
+    """A verdict for each claim of one family, in each way to measure it."""
+    ways = list(answers[0].ways)
+    rows = [
+        [
+            answer.claim,
+            answer.statement,
+            *(Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways),
+            answer.paper,
+        ]
+        for answer in answers
+    ]
+    frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
+    return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
+
+
+def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.DataFrame:
+    """Every part of the claims, measured in one of the ways, with these `names`, if any."""
+    rows = []
+    for answer, part in ((one, part) for one in answers for part in one.ways[how].parts):
+        # Of a return as many as the margin needs, which depends on the environment's scale.
+        of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
+        digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
+        pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
+        rows.append(
+            [
+                answer.claim,
+                "all" if len(part.environments) > 1 else part.environments[0],
+                names.get(part.metric, part.metric),
+                " over ".join(pair),
+                _number(part.seeds),
+                _estimate(vars(part), "difference", digits, ends=""),
+                *(_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)),
+                _estimate(vars(part), "probability", 2),
+                *(_number(part.in_paper, digits), _number(part.worth_mentioning, digits)),
+                _number(part.detectable, digits),
+                part.outcome,
+            ]
+        )
+    heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
+    return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
+
+
+def costs(
+    records: Sequence[Mapping[str, Any]], runs: pd.DataFrame, labels: Mapping[str, str]
+) -> pd.DataFrame:
+    """What the runs of each environment and variant took, by their `run.json`."""
+    frame = pd.DataFrame(
+        [
+            {key: record["config"][key] for key in ("environment", "variant", "seed")}
+            | {key: record[key] for key in ("seconds", "peak_memory_mb")}
+            for record in records
+        ]
+    ).rename(columns={"environment": "env"})
+    frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
+    rows = [
+        [
+            env,
+            labels[str(variant)],
+            number(len(own)),
+            number(own["env_steps"].sum() / 1000),
+            *(duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")),
+            number(own["peak_memory_mb"].max()),
+        ]
+        for (env, variant), own in frame.groupby(["env", "variant"], sort=False)
+    ]
+    heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
+    return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
+
+
+def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
+    """The PPO hyperparameters, from the resolved settings of each environment.
+
+    The rows of the paper and Adam; then this project's further settings, those without a label
+    named after their key. A value that is not the same in all environments is shown for each.
+    """
+    own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
+    rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
+    rows += [["Optimizer", "Adam"]]
+    rows += [
+        [own[name], _setting(ppo, name)]
+        for name in PPOConfig.model_fields
+        if name not in paper.rows
+    ]
+    return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
+
+
+def _grid(
+    table: pd.DataFrame,
+    cell: Callable[[pd.DataFrame], str | Cell],
+    head: str = "",
+    rows: str = "variant",
+    columns: str = "env",
+) -> pd.DataFrame:
+    """A row for each of `rows` and a column for each of `columns`; empty where there is nothing."""
+    groups = dict(list(table.groupby([rows, columns], sort=False)))
+    across = list(table[columns].unique())
+    lines = [
+        [name, *(cell(groups[name, other]) if (name, other) in groups else "" for other in across)]
+        for name in table[rows].unique()
+    ]
+    return pd.DataFrame(lines, columns=[head, *across])
+
+
+def _rows(
+    table: pd.DataFrame, columns: Mapping[str, Callable[[pd.Series], str | Cell]]
+) -> pd.DataFrame:
+    """A row for each of the table's, what is printed in each column by its head."""
+    lines = [[cell(row) for cell in columns.values()] for _, row in table.iterrows()]
+    return pd.DataFrame(lines, columns=list(columns))
+
+
+def _labels(settings: MetricsConfig) -> dict[str, str]:
+    return {metric.name: metric.label for metric in all_metrics(settings)}
+
+
+def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:
+    """A row of a `summary`, with the number of seeds that never got there."""
+    mark = f"†{row['censored']}" if row["censored"] else ""
+    return estimate(row["mean"], row["low"], row["high"], digits, mark, best)
+
+
+def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell:
+    """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
+    prefix = f"{name}_" if ends is None else ends
+    return Cell([estimate(row[name], row[f"{prefix}low"], row[f"{prefix}high"], digits)])
+
+
+def _number(value: float | None, digits: int = 0) -> Cell:
+    return Cell([Value(number(value, digits))])
+
+
+def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
+    """The value of one setting, for each group of environments that share it."""
+    environments: dict[str, list[str]] = {}
+    for environment, config in ppo.items():
+        environments.setdefault(_value(getattr(config, name)), []).append(environment)
+    if len(environments) == 1:
+        return next(iter(environments))
+    values = [Value(f"{value} ({', '.join(whose)})") for value, whose in environments.items()]
+    return Cell(values, joint="; ")
+
+
+def _value(value: Any) -> str:
+    """A setting as it is printed."""
+    match value:
+        case None:
+            return "all steps of the update"
+        case bool():
+            return "yes" if value else "no"
+        case list():
+            return ", ".join(map(_value, value))
+        case CompiledNetwork():
+            return "tanh network"
+        case TorchModule():
+            return value.module
+        case float() if "e" in repr(value):
+            mantissa, exponent = repr(value).split("e")
+            power = str(int(exponent)).translate(str.maketrans("-0123456789", POWERS))
+            return f"{mantissa} \u00d7 10{power}"
+        case _:
+            return str(value)
