@@ -88,9 +88,12 @@ class FinishedRun:
         types, content = get_type_hints(EpisodeRecord), self.content(files.EPISODES)
         try:
             lines = csv.DictReader(io.StringIO(content.decode(), newline=""))
-            return [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
+            rows = [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
         except (KeyError, TypeError, ValueError, csv.Error):
-            raise RecordError(f"{self.folder / files.EPISODES}: {NEVER_WRITTEN}") from None
+            rows = []
+        if len(rows) != self.record["config"]["episodes"]:
+            raise RecordError(f"{self.folder / files.EPISODES}: {NEVER_WRITTEN}")
+        return rows
 
     @cached_property
     def diagnostics(self) -> "pd.DataFrame | None":
