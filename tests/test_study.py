@@ -59,7 +59,7 @@ metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-
 metrics: {random_return: {CartPole-v1: "22"}}  # metrics.random_return.CartPole-v1, '22', number
 metrics: {constants: {learned: mace_full, fixed: []}}  # metrics.constants.fixed, [], 1 item
 metrics: {constants: {learned: ppo, fixed: [ppo]}}  # metrics, constants.fixed, learned, 'ppo'
-figure: {columns: 0}  # figure.columns, 0, greater than 0
+figure: {columns: 0}  # figure.columns, 0, greater than
 figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
