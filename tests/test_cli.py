@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from shared import GOOD, OUTCOME, RESULTS, Bonanza, call, files
+from shared import GOOD, RESULTS, Bonanza, call, files
 from snakemake.utils import update_config
 
 from mace_rl import cli
@@ -24,8 +24,6 @@ CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 
 # What is changed in a good command, and what the message has to name.
 MISTAKES = {
-    "unknown environment": ({"--env": "CartPole-v9"}, ["'CartPole-v9'", "'CartPole-v1'"]),
-    "unknown variant": ({"--variant": "mace_ful"}, ["'mace_ful'", "'mace_full'"]),
     "variant of a further study": ({"--variant": "beta_0.4"}, ["'beta_0.4'", "--config FILE"]),
     "seed beyond 32 bits": ({"--seed": "4294967296"}, ["4294967296"]),
     "no episodes": ({"--episodes": "0"}, ["--episodes", "0", "at least 1"]),
@@ -40,7 +38,6 @@ MALFORMED = [
     ["tarin"],
     ["train", "--env", "CartPole-v1", "--var", "ppo", "--episodes", "0"],
     ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
-    ["train", *sum(GOOD.items(), ()), "--out", "x", "--config"],
     ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
     ["verify"],
     ["status"],
@@ -155,45 +152,25 @@ def test_anything_in_place_of_a_value_is_accepted_or_refused_in_one_line(path, v
         assert "\n" not in str(error) and str(error).startswith("some.yaml: ")
 
 
-def test_a_run_by_hand_then_again_then_as_another_then_damaged(monkeypatch, tmp_path, caplog):
+def test_a_run_by_hand_then_as_another_then_again(monkeypatch, tmp_path, caplog):
     caplog.set_level("INFO")
     out = tmp_path / "a run with ümlaut"
     options = GOOD | {"--out": str(out)}
-    words = ["train", *sum(options.items(), ())]
-    assert call(monkeypatch, *words) == (0, "")
+    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
     assert files(out) == RESULTS
     whole = {path.name: path.read_bytes() for path in out.iterdir()}
     caplog.clear()
-    named = [str(out), "choose another folder, or set this run aside: --restart"]
+    steps = overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9")
     for option, value, difference in (
         ("--seed", "1", "config.seed was 0 and is 1"),
         ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),
-        (
-            "--config",
-            overlay(tmp_path, "CartPole-v1", "max_episode_steps: 9"),
-            "config.max_episode_steps was None and is 9",
-        ),
+        ("--config", steps, "config.max_episode_steps was None and is 9"),
     ):
-        refused(monkeypatch, options | {option: value}, [*named, difference])
-
-    def damaged(name: str, content: bytes, *expected: str) -> None:
-        (out / name).write_bytes(content)
-        refused(monkeypatch, options, [*named, *expected])
-        (out / name).write_bytes(whole[name])
-
-    for name in OUTCOME:
-        damaged(name, whole[name][:-1], name, "cut off")
-        (out / name).unlink()
-        refused(monkeypatch, options, [*named, name, "missing"])
-        (out / name).write_bytes(whole[name])
-    record = json.loads(whole["run.json"])
-    changed = record | {"sources": ""}
-    damaged("run.json", json.dumps(changed).encode(), "a finished run of other code, in mace_rl")
-    changed = record | {"versions": record["versions"] | {"numpy": "1.0"}}
-    expected = "a finished run where versions.numpy was '1.0' and is '"
-    damaged("run.json", json.dumps(changed).encode(), expected)
+        named = [str(out), "choose another folder, or set this run aside: --restart", difference]
+        refused(monkeypatch, options | {option: value}, named)
     assert not caplog.text  # neither trained nor called finished
-    assert call(monkeypatch, *words) == (0, "") and "finished" in caplog.text
+    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    assert "finished" in caplog.text
     assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
 
 

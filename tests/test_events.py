@@ -81,22 +81,6 @@ def test_events_of_a_run_that_is_not_finished(run_config, monkeypatch, tmp_path)
         assert len(returns) == len(found["updates/entropy"]) == count
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (lambda run: (run / files.EPISODES).write_text("episode\n1\n"), "SHA-256"),
-        (lambda run: (run / files.RECORD).write_text("{"), "not readable"),
-        (lambda run: (run / files.RECORD).rename(run / files.CHECKPOINT), "cut off or altered"),
-        (lambda run: (run / files.RECORD).unlink(), "no run in it"),
-    ],
-)
-def test_damaged_records_become_no_events(damage, words, run, monkeypatch):
-    damage(run)
-    code, message = call(monkeypatch, "tensorboard", str(run))
-    assert code == 1 and words in message and str(run) in message and "\n" not in message
-    assert not (run / files.EVENTS).exists()
-
-
 def test_without_the_package_one_line_says_so(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     code, message = call(monkeypatch, "tensorboard", str(run))

@@ -163,6 +163,9 @@ def test_another_paper_has_its_tables_verdicts_and_pictures(folder):
         ("linear_decay.yaml", ": 0.4", ": 1.5", "episode 1: β is 1.5, which is"),
         ("grid_counts.yaml", "kind: custom", "kind: counts", "estimator and kind: custom"),
         ("grid_counts.py", "1 / (1", "2 / (1", "the curiosity bonus is 2.0, which is"),
+        ("grid_counts.py", "(states)])", "(states)][:1])", "the novelty is float64 of shape (1,)"),
+        ("linear_decay.py", "return self", "return [1] or self", "β is int64 of shape"),
+        ("layer_norm.py", "    return ", "    return None and ", "which returned None"),
     ],
 )
 def test_mistakes_get_one_line(folder, train, file, old, new, message):

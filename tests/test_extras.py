@@ -14,7 +14,7 @@ from shared import call, finish
 from mace_rl.config.section import ConfigError
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.runs.provenance import sources_of
+from mace_rl.runs.provenance import identity
 from mace_rl.trainer import Trainer
 from mace_rl.wrappers import CuriosityReward
 
@@ -58,9 +58,9 @@ def test_a_package_counts_as_a_whole(run_config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     beta = {"kind": "custom", "rule": "own.rule:Rule"}
     config = run_config("CartPole-v1", "mace_fixed", beta=beta)
-    before = sources_of(config)
+    before = identity(config)["sources"]
     (tmp_path / "own" / "shared_part.py").write_text("x = 1\n")
-    assert sources_of(config) != before
+    assert identity(config)["sources"] != before
 
 
 def test_a_rule_is_told_when_the_policy_changes(run_config):

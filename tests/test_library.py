@@ -8,14 +8,12 @@ import re
 import subprocess
 import sys
 import tempfile
-from importlib.metadata import requires, version
 from pathlib import Path
 
 import gymnasium
 import numba
 import numpy as np
 import pytest
-from packaging.requirements import Requirement
 from shared import call
 
 import mace_rl
@@ -90,18 +88,13 @@ def given(value: object) -> dict:
 MISTAKES = {
     "unknown key 'ppo.clpi'": {"ppo": {"clpi": 0.1}},
     "unknown key 'epsiodes' (value 3); the nearest known key is 'episodes'": {"epsiodes": 3},
-    "episodes is 0, but should be greater than 0": {"episodes": 0},
     "variant has 'mace_ful'": {"variant": "mace_ful"},
-    "seed is 1.5": {"seed": 1.5},
     "environment_arguments.d is datetime.date(2024, 1, 1), but it should be made of": given(
         datetime.date(2024, 1, 1)
     ),
     "environment_arguments.d is [{1}], but": given([{1}]),
     "environment_arguments.d is {1: 2}, but": given({1: 2}),
     "environment_arguments.d is nan, but it should be made of finite": given(math.nan),
-    "environment_arguments.d is array(": given(np.zeros(2)),
-    "environment_arguments.d is <built-in function len>": given(len),
-    "environment_arguments.d is b'x'": given(b"x"),
     "surrogates not allowed": given("\ud800"),
     "beta.arguments.d is {1}": {"beta": OWN | {"rule": "a:B"}},
     "bonus.arguments.d is {1}": {"bonus": OWN | {"estimator": "a:B"}},
@@ -121,13 +114,19 @@ def test_a_mistake_gets_one_line(message):
     assert "\n" not in str(caught.value)
 
 
+class Text(str):
+    __slots__ = ()
+
+
 def test_arguments_are_what_json_gives_back(monkeypatch, tmp_path):
     """So that what is played later is what was trained, and the same call finds its run again."""
-    given = {"map_name": None, "desc": (np.str_("SF"), "FG"), "is_slippery": np.bool_(False)}
+    map_ = Text("SF")  # as an enum's members are texts or numbers
+    given = {"map_name": None, "desc": (map_, "FG"), "is_slippery": np.bool_(False)}
     run = settings("FrozenLake-v1", "ppo", episodes=2, environment_arguments=given)
     plain = {"map_name": None, "desc": ["SF", "FG"], "is_slippery": False}
     assert run.environment_arguments == plain
     assert [*map(type, run.environment_arguments.values())] == [type(None), list, bool]
+    assert type(run.environment_arguments["desc"][0]) is str
     for _ in range(2):
         train(run, folder=tmp_path)
     found = json.loads((tmp_path / "run.json").read_text())["config"]
@@ -164,14 +163,6 @@ def test_the_folder_of_an_id_with_a_namespace(register, monkeypatch, tmp_path):
     assert call(monkeypatch, *words, "--episodes", "2", "--max-episode-steps", "5") == (0, "")
     record = json.loads(Path("runs/Own+Cart-v0/ppo/seed0/run.json").read_text())
     assert record["config"]["environment"] == "Own/Cart-v0"
-
-
-def test_what_is_installed_satisfies_every_extra_but_parquet():
-    """pip check does not look at extras; `make lock` may have been forgotten."""
-    for line in requires("mace-rl"):
-        requirement = Requirement(line)
-        if requirement.name != "pyarrow":
-            assert requirement.specifier.contains(version(requirement.name)), line
 
 
 def test_the_readme_s_example(monkeypatch, tmp_path):

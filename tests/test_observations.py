@@ -13,6 +13,7 @@ from mace_rl.runs.observations import ObservationError, encoded
 FOUR, BOX = Discrete(4, start=-1), Box(-1, 1, (4,))
 CARDS = Tuple([Discrete(32), Discrete(11), Discrete(2)])
 MIXED = Dict({"a": Box(-1, 1, (2, 3)), "b": FOUR, "c": MultiBinary(2), "d": CARDS})
+MIXED["e"] = MultiDiscrete([2, 3], start=[-1, 1])
 
 
 @pytest.mark.parametrize("space", [FOUR, BOX, Box(-1, 1, (1, 4)), CARDS, MIXED], ids=str)
@@ -45,7 +46,9 @@ WRONG = [
     (FOUR, [3, -2, 0.0, None, "x", (0, {}), [3, 0], [0.5, 0.5, 0, 0], [[0, 1]], np.eye(3), 1j]),
     (BOX, [0, 0.5, np.zeros(3), np.zeros((4, 3)), [np.nan] * 4, [1e300] * 4, (HOT, {})]),
     (CARDS, [(1, 2), (1, 2, 2), (1.0, 2, 1), {1: 0, 2: 0, 0: 0}, ((1, 2, 1), {}), 3, [], ()]),
-    (MIXED, [{}, {"a": 1}, (MIXED.sample(), {}), {**MIXED.sample(), "e": 1}]),
+    (MIXED, [{}, {"a": 1}, (MIXED.sample(), {}), {**MIXED.sample(), "f": 1}]),
+    (MIXED, [{**MIXED.sample(), "e": [1, 1]}]),
+    (BOX, [np.zeros((0, 4))]),
 ]
 
 

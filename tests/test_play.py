@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from shared import LAYER_NORM, call, finish
+from shared import LAYER_NORM, call, finish, likeliest
 
 from mace_rl.config.reading import merge
 from mace_rl.runs.agent import load_agent
@@ -80,33 +80,9 @@ def test_an_agent_plays_as_at_the_end_of_its_training(
     capsys.readouterr()
     assert call(monkeypatch, "evaluate", str(tmp_path), "--episodes", "3") == (0, "")
     assert capsys.readouterr().out.startswith("3 episodes: mean return ")
-    (tmp_path / "agent.pt").write_bytes((tmp_path / "agent.pt").read_bytes()[:-7])
-    code, message = call(monkeypatch, "evaluate", str(tmp_path))
-    assert code == 1 and "agent.pt" in message and "cut off" in message
 
 
 def test_without_chance_discrete_actions_are_the_most_probable(trained):
-    folder, env = trained("CartPole-v1", episodes=3, engine="torch"), gymnasium.make("CartPole-v1")
-    policy, returns = load_agent(folder).policy, []
-    env.reset(seed=5)
-    env.reset(seed=5)
-    for _ in range(3):
-        observation, _ = env.reset()
-        returns.append(0.0)
-        ends = [False]
-        while not any(ends):
-            action = int(policy(observation).probs.argmax())
-            observation, reward, *ends, _ = env.step(action)
-            returns[-1] += reward
-    assert evaluate(folder, 3, 5, deterministic=True).tolist() == returns
-
-
-@pytest.mark.parametrize("command", ["evaluate", "watch"])
-@pytest.mark.parametrize("folder", ["nope", "unfinished", "a file"])
-def test_without_a_finished_run_nothing_is_played(monkeypatch, tmp_path, command, folder):
-    (tmp_path / "unfinished").mkdir()
-    (tmp_path / "unfinished/checkpoint.pt").touch()
-    (tmp_path / "a file").touch()
-    path = tmp_path / folder
-    expected = f"mace-rl: no finished run in {path}: it has no run.json"
-    assert call(monkeypatch, command, str(path)) == (1, expected)
+    folder = trained("CartPole-v1", episodes=3, engine="torch")
+    expected = likeliest(load_agent(folder).policy, 3, 5)
+    assert evaluate(folder, 3, 5, deterministic=True).tolist() == expected

@@ -96,7 +96,7 @@ def test_what_run_json_does_not_describe_is_refused(tmp_path):
     assert read_episodes(path, 3, digest).equals(read_episodes(path, 3))
     path.write_text(text().replace("9.5", "9.75"))
     assert len(read_episodes(path, 3)) == 3
-    with pytest.raises(RecordError, match=r"e\.csv: not the file that run\.json describes"):
+    with pytest.raises(RecordError, match=r"e\.csv: missing, cut off or altered"):
         read_episodes(path, 3, digest)
     path.write_text(text().replace("9.5", "x"))
     with pytest.raises(RecordError, match="line 2: extrinsic_return is 'x'"):
@@ -136,10 +136,10 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     path.write_text("before")
 
     def fail(descriptor):
-        raise OSError("disk full")
+        raise OSError(28, "disk full")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OSError, match=r"disk full: '.*/episodes\.csv'"):
         write_episodes(path, columns())
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]

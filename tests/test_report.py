@@ -18,7 +18,7 @@ from invented import CLAIMS, ENVIRONMENTS, VARIANTS
 from PIL import Image
 
 from mace_rl import files
-from mace_rl.runs.checkpoint import CheckpointError
+from mace_rl.refusal import Refusal
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
 from mace_rl.study.config import read_study
@@ -232,7 +232,7 @@ def test_agents_that_do_the_same_untrained_share_a_film(
     assert first.title == "Before training: PPO"
     assert second.title == "Before training: MACE_FIXED, MACE_FULL"
     (seed1 / files.AGENT).write_bytes(b"another")
-    with pytest.raises(CheckpointError, match=r"agent\.pt: missing, cut off or altered"):
+    with pytest.raises(Refusal, match=r"agent\.pt: missing, cut off or altered"):
         animations({("HopperBulletEnv-v0", "ppo"): seed1}, labels, tmp_path)
     # An environment that cannot be drawn is said.
     run(run_config("PlantedHelp-v0", episodes=1), tmp_path / "planted")

@@ -1,5 +1,7 @@
 """Episodes: the compiled ones against Gymnasium's own environments, the ordinary ones by hand."""
 
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from mace_rl.environments.rollout import (
     roll_out_compiled,
     rollout_for,
 )
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import mlp
 
 CLASSIC = ["CartPole-v1", "Acrobot-v1"]
@@ -260,6 +263,7 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
         ({"action_space": Box(-1, 1, (0,))}, 10, "has 0 numbers"),
         ({"action_space": Box(0, 9, (1,), np.int64)}, 10, "of integers"),
         ({"action_space": Discrete(10**9)}, 10, "has 1000000000 numbers"),
+        ({"action_space": Box(-1, 1, (200,))}, 10**6, "time limit is 1000000, not up to 500000"),
         *(
             ({"observation_space": Tuple([Dict({"a": part}), Discrete(2)])}, 10, message)
             for part, message in [
@@ -307,6 +311,9 @@ class Odd(Bonanza):
         ("step", lambda _: (np.zeros(2), 0, True, {}), "step 1: not .*expected 5, got 4"),
         ("step", lambda _: (None, 0, True, False, {}), "the observation None .* after step 1"),
         ("step", lambda _: (np.zeros(2), [1, 2], True, False, {}), "as reward after step 1"),
+        ("step", lambda _: (np.zeros(2), [1, [2]], True, False, {}), "as reward after step 1"),
+        ("step", lambda _: ((np.zeros(2), {}), 0, True, False, {}), "the observation .* step 1"),
+        ("reset", lambda **_: sys.exit(0), "'Odd-v0': SystemExit: 0"),
         ("step", lambda _: (np.zeros(2), 0, None, False, {}), "None as terminated after step 1"),
         ("step", lambda _: (np.zeros((2, 1)), np.ones(1), np.True_, [0], None), ""),
     ],
@@ -319,6 +326,26 @@ def test_what_is_not_gymnasium_s_form_is_told_in_one_line(register, method, does
         return
     with pytest.raises(ConfigError, match=rf"^environment [^\n]*{message}[^\n]*$"):
         play(environment_of("Odd-v0"))
+
+
+PARTS = Dict(a=Discrete(3), b=Tuple([Box(0, 1, (2,)), Box(0, 1, (1,))]), c=MultiDiscrete([2, 3]))
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        *({"a": state} for state in (-1, 3, 1.5, None, [0, 1])),
+        *({"c": np.array(state)} for state in ([2, 0], [0, -1], [0])),
+        *({"b": boxes} for boxes in ((np.zeros(1), np.zeros(2)), (np.zeros(2),), 0)),
+    ],
+)
+def test_a_part_that_is_not_of_its_space_is_refused(part):
+    good = {"a": 1, "b": (np.zeros(2), np.zeros(1)), "c": np.array([1, 2])}
+    spaces = Spaces("Parts-v0", PARTS, Discrete(2))
+    assert (spaces.encode(good) == [0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 1]).all()
+    for given in (good | part, {"a": 1}):
+        with pytest.raises(ConfigError, match=r"Parts-v0.* after step 4, but its .* is Dict"):
+            spaces.encode(given, 4)
 
 
 def test_tuples_are_flattened():

@@ -6,7 +6,6 @@ import itertools
 import json
 import logging
 import os
-import pickle
 import random
 import re
 import shlex
@@ -42,7 +41,7 @@ from mace_rl import sources
 from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.environments import hopper
-from mace_rl.files import LOCK, write_atomically
+from mace_rl.files import LOCK
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
 from mace_rl.trainer import Trainer
@@ -149,7 +148,7 @@ def test_an_interrupted_run_says_how_far_it_is_and_its_seconds_count(interrupted
     assert progress["env_steps"] == progress["recent_return"]  # CartPole pays 1 a step
     path = interrupted.directory / "checkpoint.pt"
     state = checkpoint.read(path)["state"] | {"seconds": 1000.0, "checkpoint_seconds": 100.0}
-    checkpoint.save(path, run.run_identity(interrupted.config), state)
+    checkpoint.save(path, provenance.identity(interrupted.config), state)
     run.run(interrupted.config, interrupted.directory)
     found = provenance_of(interrupted.directory)
     assert len(found["interruptions"]) == 1
@@ -292,8 +291,17 @@ def test_a_job_that_code_of_the_users_ends_has_failed(tmp_path, ends, closed):
     )
 
 
+def test_what_a_program_has_set_in_pytorch_changes_nothing(run_config, tmp_path):
+    config = run_config("CartPole-v1", "ppo", 0, episodes=2, engine="torch")
+    run.run(config, tmp_path / "plain")
+    with torch.inference_mode(), torch.autocast("cpu"):
+        run.run(config, tmp_path / "set")
+    one, other = ((tmp_path / name / "agent.pt").read_bytes() for name in ("plain", "set"))
+    assert one == other
+
+
 def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "LOCK_SECONDS", 0.0)
+    monkeypatch.setattr(run, "LOCK_SECONDS", 0.3)  # which a fork may take
     asleep, wake = os.pipe()
     with run.exclusive(tmp_path):
         worker = os.fork()
@@ -303,6 +311,7 @@ def test_a_worker_of_the_environment_does_not_hold_the_folder(tmp_path, monkeypa
             os._exit(0)
         with pytest.raises(run.RunError), run.exclusive(tmp_path):
             pass
+    monkeypatch.setattr(run, "LOCK_SECONDS", 5.0)  # a worker takes a moment to close its copy
     with run.exclusive(tmp_path):
         assert os.waitpid(worker, os.WNOHANG) == (0, 0)  # it lives
     os.close(wake)
@@ -334,16 +343,6 @@ def test_killed_while_writing(
     (directory / ".checkpoint.pt.12345.tmp").write_bytes(b"half a check")  # goes
     (interruption,) = completes(config, directory)["interruptions"]
     assert interruption["after_episode"] == after
-
-
-def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match=r"No space left on device: '.*/episodes\.csv'"):
-        write_atomically(tmp_path / "episodes.csv", "")
-    assert not list(tmp_path.iterdir())
 
 
 def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path, monkeypatch):
@@ -382,7 +381,6 @@ def signed(content: bytes) -> bytes:
         (lambda content: content[:-1] + bytes([content[-1] ^ 1]), "cut off or altered"),
         (lambda content: content[:-1], "cut off or altered"),
         (lambda _: b"", "cut off or altered"),
-        (lambda _: signed(pickle.dumps(Bomb(), protocol=2)), "not a readable archive"),
         (lambda _: signed(checkpoint.archive({"identity": Bomb()})), "not a readable archive"),
     ],
 )
@@ -487,6 +485,16 @@ class Draws(gymnasium.Env):
         return np.full(1, reward, np.float32), reward, False, False, {}
 
 
+class Offers(gymnasium.Wrapper):
+    """Has what its environment remembers beside its generator."""
+
+    def state_dict(self) -> dict:
+        return {"resets": self.env.resets}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.env.resets = state["resets"]
+
+
 def seed_all(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
@@ -496,7 +504,7 @@ def seed_all(seed: int) -> None:
 @pytest.mark.parametrize(
     ("kind", "saved"),
     [
-        *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered")),
+        *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered", "wrapper")),
         *((kind, False) for kind in ("own", "kept", "counter")),
         *((name, True) for name in ("FrozenLake-v1", "Pendulum-v1", "AntBulletEnv-v0")),
         ("HumanoidFlagrunHarderBulletEnv-v0", False),
@@ -506,7 +514,8 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
     run_config, register, tmp_path, kill, checkpoint_every, caplog, kind, saved
 ):
     """By a replay of the last episodes, which changes nothing."""
-    name = kind if "-v" in kind else register("Draws-v0", Draws, 5, kind=kind)
+    draws = (lambda **given: Offers(Draws(**given))) if kind == "wrapper" else Draws
+    name = kind if "-v" in kind else register("Draws-v0", draws, 5, kind=kind)
     config = run_config(name, "ppo", 0, episodes=30, max_episode_steps=60 if "-v" in kind else 5)
     checkpoint_every(1)
     for folder in ("killed", "whole"):
@@ -546,7 +555,8 @@ def test_checkpoints_cost_at_most_one_percent(monkeypatch, cost, wait):
     """Every 10 s, or as seldom as their cost demands; the clock is set by hand."""
     now = [1000.0]
     monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    clock = run.Clock(900.0, 2.0, 0.7)  # 100 s before an interruption, 0.7 of them on checkpoints
+    clock = run.Clock(900.0, 2.0)
+    clock.checkpoint_seconds = 0.7  # before an interruption
     assert clock.elapsed() == 100 and not clock.checkpoint_due()
     now[0] += 10
     assert clock.checkpoint_due()

@@ -7,6 +7,7 @@ import shutil
 import sys
 import zipfile
 
+import numpy as np
 import pytest
 import torch
 from shared import LAYER_NORM, call
@@ -20,6 +21,7 @@ from mace_rl.runs.checkpoint import CheckpointError, archive
 from mace_rl.runs.provenance import file_digest
 
 PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
+NETWORK = {"kind": "torch", "module": "pydoc:pipepager"}
 OWN = {"kind": "custom", "estimator": "evil:Own"}
 HOSTILE = {  # by the key that is named
     "beta.rule": {"beta": PAGER},
@@ -66,14 +68,19 @@ def test_a_run_runs_only_this_package_s_code(kept, monkeypatch, tmp_path, key):
 
 
 def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkeypatch, tmp_path):
-    run = kept(beta=PAGER)
-    for words in (["evaluate", str(run)], ["watch", str(run)], ["verify", "."]):
-        code, said = call(monkeypatch, *words, "--trust")
-        assert code == 1 and "beta.rule has 'pydoc:pipepager', but it should name" in said
+    play = ["evaluate", "watch"]
+    for key, settings, commands in (
+        ("ppo.network.module", {"ppo": {"network": NETWORK}}, [*play, "verify"]),
+        ("beta.rule", {"beta": PAGER}, ["verify"]),  # which playing does not need
+    ):
+        run = kept(**settings)
+        for command in commands:
+            code, said = call(monkeypatch, command, str(run), "--trust")
+            assert code == 1 and f"{key} has 'pydoc:pipepager', but it should name" in said
     assert not (tmp_path / "ran").exists()
     folder = str(trained("CartPole-v1", "ppo", episodes=2, ppo={"network": LAYER_NORM}))
-    for words in (["evaluate", folder], ["watch", folder, "--out", "a.gif"]):
-        assert call(monkeypatch, *words, "--trust") == (0, "")
+    for command in play:
+        assert call(monkeypatch, command, folder, "--trust") == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -94,6 +101,27 @@ def test_names_of_this_package_and_other_texts_are_no_code_from_outside():
     assert [*code_outside({"a": "mace_rl_x:Y", "b": [" os:X"], "c": ":"})] == ["c", "b", "a"]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
+        (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
+        (r"\A.*\Z", '["config", "outputs"]', "the configuration is "),
+        (r'"outputs": \{.*?\}', '"outputs": 3', "outputs is 3, but"),
+        (r'"machine": \{.*?\}', '"machine": 3', "machine is 3, but"),
+        ('"mace_fixed"', '"a,b"', "config.variant is 'a,b', but"),
+        ('"CartPole-v1"', '"CartPole-v1,0"', "config.environment is 'CartPole-v1,0', but"),
+    ],
+)
+def test_what_no_run_wrote_is_one_line(kept, monkeypatch, old, new, message):
+    run = kept()
+    text = (run / files.RECORD).read_text()
+    (run / files.RECORD).write_text(re.sub(old, new, text, count=1, flags=re.DOTALL))
+    for words in (f"evaluate {run}", f"watch {run}", "verify .", "export . --out a.csv"):
+        code, said = call(monkeypatch, *words.split())
+        assert code == 1 and re.search(rf"^[^\n]*run\.json: {message}[^\n]*$", said), said
+
+
 def compressed():
     """A zip file that unpacks to more than it is."""
     data = io.BytesIO()
@@ -103,7 +131,11 @@ def compressed():
 
 
 BIAS = "policy.network.2.bias"
+STD = "policy.std"
 DAMAGE = {
+    f"{BIAS} is meta": lambda s: archive(s | {BIAS: s[BIAS].to("meta")}),
+    f"{STD} has NaN or Inf in it, or is not": lambda s: archive(s | {STD: s[STD] * 0}),
+    "not a readable archive: Weights only load failed$": lambda _: archive({"a": np.zeros(1)}),
     f"{BIAS} is .*shape .3,.*should be .*shape .64,": lambda s: archive(s | {BIAS: torch.ones(3)}),
     f"{BIAS} has NaN or Inf": lambda s: archive(s | {BIAS: s[BIAS] * torch.nan}),
     f"{BIAS} is .*float64": lambda s: archive(s | {BIAS: s[BIAS].double()}),

@@ -12,6 +12,7 @@ those that are there; equal runs give equal files. `make tables` reads what is t
 """
 
 import argparse
+import hashlib
 import io
 import itertools
 import json
@@ -28,7 +29,7 @@ import numpy as np
 
 from mace_rl import files
 from mace_rl.files import write_atomically
-from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.records import EpisodeRecord
 
 AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
@@ -39,12 +40,15 @@ COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episo
 MEMBERS = re.compile(
     "|".join([*COLUMNS, f"seed[0-9]{{1,10}}/{files.RECORD}", f"{AT_PLAY}/{files.AGENT}"])
 )
+NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*\.tar\.xz"
 DAMAGE = (tarfile.TarError, lzma.LZMAError, OSError, EOFError)
 
 
 def read(archive: Path) -> dict[str, bytes]:
     """What is in an archive, by name; `ValueError` with its path for what `write` never wrote."""
     try:
+        if not re.fullmatch(NAME, archive.name):
+            raise ValueError("its name is not VARIANT.tar.xz")
         return _read(archive.read_bytes())
     except (*DAMAGE, ValueError, LookupError, TypeError, RecursionError) as error:
         raise ValueError(f"{archive} is not as a packed one is: {error}") from None
@@ -74,7 +78,9 @@ def _read(compressed: bytes) -> dict[str, bytes]:
         if not isinstance(seconds, int | float):
             raise ValueError(f"{name} has {seconds!r} seconds")
         own = {column: values[start : start + episodes] for column, values in columns.items()}
-        found[name.replace(files.RECORD, files.EPISODES)] = _together(own)
+        found[name.replace(files.RECORD, files.EPISODES)] = together = _together(own)
+        if hashlib.sha256(together).hexdigest() != record["outputs"][files.EPISODES]:
+            raise ValueError(f"{name} has other episodes (SHA-256 differs)")
         start += episodes
     if not start or any(len(values) != start for values in columns.values()):
         raise ValueError(f"its runs have {start} episodes together, but its columns others")
@@ -134,18 +140,15 @@ def pack(results: Path, archives: Path) -> int:
         for run in variant.glob("seed*"):
             if not (run / files.RECORD).exists():
                 continue  # not finished
-            digests = read_record(run / files.RECORD)["outputs"]
+            whole = FinishedRun(run)
             before = packed.get(f"{run.name}/{files.RECORD}")
-            if before and json.loads(before)["outputs"] != digests:
+            if before and json.loads(before)["outputs"] != whole.record["outputs"]:
                 raise ValueError(f"{run}: {archive} has another run of this seed")
             kept = [files.EPISODES]
             if run.name == AT_PLAY and (run / files.AGENT).stat().st_size <= LARGEST:
                 kept.append(files.AGENT)
-            for name in kept:
-                if file_digest(run / name) != digests[name]:
-                    raise ValueError(f"{run / name}: not the file that run.json describes")
-            for name in (*kept, files.RECORD):
-                content[f"{run.name}/{name}"] = (run / name).read_bytes()
+            content |= {f"{run.name}/{name}": whole.content(name) for name in kept}
+            content[f"{run.name}/{files.RECORD}"] = (run / files.RECORD).read_bytes()
         if content != packed:  # compressing takes seconds
             write(archive, content)
         count += sum(name.endswith(files.RECORD) for name in content)
@@ -194,7 +197,7 @@ def unpack_sample(archives: Path, results: Path, count: int) -> int:
         archive, content = packed[place], read(packed[place])
         run = draws.choice([name for name in content if name.endswith(files.RECORD)])
         if json.loads(content[run])["seconds"] < LONGEST:
-            folder = results / "runs" / archive.parent.name / archive.name.partition(".tar")[0]
+            folder = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
             names = (run, run.replace(files.RECORD, files.EPISODES))
             _put(folder, {name: content[name] for name in names})
             left -= 1

@@ -14,7 +14,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.library import settings
 from mace_rl.refusal import Refusal
-from mace_rl.runs.finished import finished
+from mace_rl.runs.finished import FinishedRun, finished
 from mace_rl.study.config import folder_of
 
 logger = logging.getLogger(__name__)
@@ -177,8 +177,7 @@ def status(arguments: argparse.Namespace) -> None:
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
     _require(arguments.seed >= 0, "--seed", arguments.seed, "be at least 0")
-    if not (arguments.folder / files.RECORD).exists():
-        raise ConfigError(f"no finished run in {arguments.folder}: it has no {files.RECORD}")
+    _ = FinishedRun(arguments.folder, arguments.trust).config  # before PyTorch, which takes seconds
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -272,9 +271,7 @@ def main() -> None:
     except (Refusal, OSError, MemoryError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except ModuleNotFoundError as error:
-        if (
-            arguments.command == "train"
-        ):  # in code of the user's own, whose place the traceback tells
+        if arguments.command == "train":  # in the user's own code, whose place the traceback tells
             raise
         extra = "tensorboard" if arguments.command == "tensorboard" else "study"
         sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")

@@ -10,14 +10,14 @@ from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.custom import custom_module
 from mace_rl.agent.learner import Learner
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import PPO
+from mace_rl.agent.ppo import PPO, ActorCritic
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
-from mace_rl.config.agent import PPOConfig, TorchModule
+from mace_rl.config.agent import TorchModule
 from mace_rl.config.beta import (
     BetaRule,
     ConstantBeta,
@@ -30,6 +30,7 @@ from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.streams import Streams
@@ -76,9 +77,21 @@ def intrinsic_reward(
             return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 
-def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: Streams) -> PPO:
-    """Policy and critics, one for each kind of reward, and what trains them."""
-    settings, size = config.ppo, environment.observation_size
+def environment(config: RunConfig, streams: Streams) -> Environment:
+    """What the agent acts in."""
+    return Environment(
+        config.environment,
+        streams.sequence("environment"),
+        config.max_episode_steps,
+        config.environment_arguments,
+    )
+
+
+def actor_critic(
+    config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams
+) -> ActorCritic:
+    """Policy and critics, one for each kind of reward, as training begins with them."""
+    settings, size = config.ppo, spaces.observation_size
     own = settings.network if isinstance(settings.network, TorchModule) else None
 
     def module(outputs: int, output_gain: float, stream: str) -> torch.nn.Module:
@@ -88,14 +101,17 @@ def ppo(config: RunConfig, environment: Environment, intrinsic: bool, streams: S
         return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
 
     network: Callable[[Any], Any] = CompiledMLP
-    learner: Callable[[PPOConfig, Policy, Any], Learner] = CompiledLearner
+    learner: type[Learner] = CompiledLearner
     if own is not None or config.engine == "torch":
         network, learner = TorchNetwork, TorchLearner
     # A small last layer starts near the uniform policy, or at means near 0.
-    actor = network(module(environment.action_size, 0.01, "actor"))
-    policy = Policy(actor, environment.action_space, settings.initial_log_std)
+    actor = network(module(spaces.action_size, 0.01, "actor"))
+    policy = Policy(actor, spaces.action_space, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
     critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
-    normaliser, generator = RunningNormaliser(size), streams["minibatches"]
-    trained = learner(settings, policy, critics)
-    return PPO(settings, policy, critics, trained, normaliser, generator)
+    return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
+
+
+def ppo(config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
+    """Policy and critics, and what trains them."""
+    return PPO(actor_critic(config, spaces, intrinsic, streams), streams["minibatches"])

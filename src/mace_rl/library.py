@@ -10,11 +10,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mace_rl import files
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.runs.finished import finished, read_rows
+from mace_rl.runs.finished import FinishedRun, finished
 from mace_rl.runs.records import EpisodeRecord
 from mace_rl.study.config import read_study
 
@@ -84,4 +83,4 @@ def train(
         directory = Path(folder or scratch)
         if restart or not finished(settings, directory):
             run(settings, directory, None, False, callback, "all" if restart else "nothing")
-        return Trained(load_agent(directory, trust=True), read_rows(directory / files.EPISODES))
+        return Trained(load_agent(directory, trust=True), FinishedRun(directory).rows)

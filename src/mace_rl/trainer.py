@@ -22,7 +22,6 @@ from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
-from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
 from mace_rl.experience import (
     Experience,
@@ -31,9 +30,9 @@ from mace_rl.experience import (
     steps,
     total_advantages,
 )
-from mace_rl.factories import beta_controller, intrinsic_reward, ppo
+from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
-from mace_rl.numerics.finite import TOO_LARGE, require_finite, require_within
+from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
 from mace_rl.refusal import Refusal
 from mace_rl.runs.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
@@ -47,12 +46,7 @@ class Trainer:
     def __init__(self, config: RunConfig) -> None:
         self.config = config
         streams = Streams(config.seed)
-        self.environment = Environment(
-            config.environment,
-            streams.sequence("environment"),
-            config.max_episode_steps,
-            config.environment_arguments,
-        )
+        self.environment = environment(config, streams)
         self.controller = beta_controller(config, self.environment, streams)
         self.curiosity = intrinsic_reward(config, self.environment, streams)
         self.ppo = ppo(config, self.environment, self.curiosity is not None, streams)
@@ -121,10 +115,10 @@ class Trainer:
         beta, bonus, intrinsic_scale = 0.0, None, 1.0
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
-            beta = self.controller.beta
+            beta = float(numbers("β", self.controller.beta, ()))
             require_within("β", beta)
             bonus = self.curiosity.bonus(episode)
-            reward = bonus.reward
+            reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
             largest = min(self.curiosity.largest, TOO_LARGE)
             require_within("the curiosity bonus", reward, 1e-6, largest)
             reward = np.maximum(reward, 0.0)

@@ -26,7 +26,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.curiosity_tracker import PARTS, CuriosityTracker
-from mace_rl.environments.spaces import Spaces
+from mace_rl.environments.spaces import Spaces, require_vectors
 
 Settings = Mapping[str, Any]
 
@@ -59,6 +59,7 @@ class CuriosityMixin(RecordConstructorArgs):
                     f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
                     " but it should be one of gymnasium.vector.AutoresetMode"
                 )
+        require_vectors(name_of(env), spaces[0])
         self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
 
     def state_dict(self) -> dict[str, Any]:

@@ -47,9 +47,10 @@ class CompiledLearner(Stateful):
             for name, parameters in self.parameters.items()
         }
 
-    def acting(self, normalisation: Normalisation) -> ActingPolicy:
+    @staticmethod
+    def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
         """See `Learner`."""
-        return CompiledActing.of(self.network, self.policy.log_std, normalisation)
+        return CompiledActing.of(cast(CompiledMLP, policy.network), policy.log_std, normalisation)
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches

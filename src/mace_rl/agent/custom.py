@@ -32,18 +32,20 @@ def custom_module(
             True,
             *(inputs, outputs, hidden_units),
             **settings.arguments,
-        )
+        ).float()
         trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
         shapes = [tuple(module(trial).shape), (2, outputs)]
         same = torch.equal(module(trial), module(trial))
+        learns = {parameter.requires_grad for parameter in module.parameters()} == {True}
     for problem, found in {
         f"gives {shapes[0]} for inputs (2, {inputs}), not {shapes[1]}": shapes[0] != shapes[1],
+        "has parameters that do not learn, or none": not learns,
         "keeps state besides its parameters (buffers)": any(True for _ in module.buffers()),
         "gives other outputs the second time (dropout?)": not same,
     }.items():
         if found:
             raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
-    return module.float()
+    return module
 
 
 @contextmanager

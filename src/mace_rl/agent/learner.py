@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from mace_rl.agent.policy import ActingPolicy, Policy
+from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation
 
@@ -43,8 +44,11 @@ class Learner(Protocol):
 
     parameters: dict[str, np.ndarray]  # see `parameters_of`
 
-    def acting(self, normalisation: Normalisation) -> ActingPolicy:
-        """The policy for rollouts."""
+    def __init__(self, config: PPOConfig, policy: Policy, critics: Any) -> None: ...
+
+    @staticmethod
+    def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
+        """A policy of such networks for rollouts."""
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches

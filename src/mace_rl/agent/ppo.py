@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,35 +21,15 @@ TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
 
 
-class PPO(Stateful):
-    """Policy, critics and the learner that trains them.
+@dataclass(eq=False)
+class ActorCritic:
+    """What plays: the policy, the critics, and the normalisation of what they see."""
 
-    The total reward R_E + β R_I is a sum, so its advantage is A_E + β A_I with a value function
-    for each part: "extrinsic" always, "intrinsic" with a curiosity bonus. The parts share no
-    weights: the bonus can reach the extrinsic critic in no way, and the actor only through β.
-    """
-
-    STATE = ("learner", "normaliser", "generator", "reward_scales", "advantage_scales")
-
-    def __init__(
-        self,
-        config: PPOConfig,
-        policy: Policy,
-        critics: Mapping[str, Network],
-        learner: Learner,
-        normaliser: RunningNormaliser,
-        generator: np.random.Generator,
-    ) -> None:
-        self.config, self.policy, self.critics, self.learner = config, policy, critics, learner
-        self.normaliser = normaliser
-        self.generator = generator
-        smallest = {"extrinsic": (1.0, config.smallest_advantage)}
-        self.reward_scales: dict[str, RewardScale] = {}
-        self.advantage_scales: dict[str, AdvantageScale] = {}
-        for kind in critics:
-            least_reward, least_advantage = smallest.get(kind, (TINY, TINY))
-            self.reward_scales[kind] = RewardScale(config.discount, least_reward)
-            self.advantage_scales[kind] = AdvantageScale(least_advantage)
+    config: PPOConfig
+    policy: Policy
+    critics: Mapping[str, Network]
+    normaliser: RunningNormaliser
+    learner_of: type[Learner]  # what trains such networks
 
     def normalise(self, observations: np.ndarray) -> np.ndarray:
         """What the networks see of `observations`, float32 [N, observation]."""
@@ -68,7 +49,30 @@ class PPO(Stateful):
 
     def acting_policy(self) -> ActingPolicy:
         """The current policy for a rollout."""
-        return self.learner.acting(Normalisation.of(*self.normalisation()))
+        return self.learner_of.acting(self.policy, Normalisation.of(*self.normalisation()))
+
+
+class PPO(ActorCritic, Stateful):
+    """An actor and critics with the learner that trains them.
+
+    The total reward R_E + β R_I is a sum, so its advantage is A_E + β A_I with a value function
+    for each part: "extrinsic" always, "intrinsic" with a curiosity bonus. The parts share no
+    weights: the bonus can reach the extrinsic critic in no way, and the actor only through β.
+    """
+
+    STATE = ("learner", "normaliser", "generator", "reward_scales", "advantage_scales")
+
+    def __init__(self, networks: ActorCritic, generator: np.random.Generator) -> None:
+        super().__init__(**vars(networks))
+        self.generator = generator
+        self.learner = self.learner_of(self.config, self.policy, self.critics)
+        smallest = {"extrinsic": (1.0, self.config.smallest_advantage)}
+        self.reward_scales: dict[str, RewardScale] = {}
+        self.advantage_scales: dict[str, AdvantageScale] = {}
+        for kind in self.critics:
+            least_reward, least_advantage = smallest.get(kind, (TINY, TINY))
+            self.reward_scales[kind] = RewardScale(self.config.discount, least_reward)
+            self.advantage_scales[kind] = AdvantageScale(least_advantage)
 
     def advantages_and_returns(
         self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool

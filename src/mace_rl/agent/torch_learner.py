@@ -23,7 +23,7 @@ class TorchLearner(Stateful):
     STATE = ("parameters", "optimiser")
 
     def __init__(self, config: PPOConfig, policy: Policy, critics: Mapping[str, Network]) -> None:
-        self.config, self.policy = config, policy
+        self.config = config
         self.parameters = parameters_of(policy, critics)
         self.actor = TorchPolicy(policy, validate=False)  # NaN is found in the gradients' norms
         self.policy_gradients = self.actor.gradients
@@ -67,9 +67,10 @@ class TorchLearner(Stateful):
                 told += means.numpy() * len(chosen) / len(order)
         return Update(norms, *told.tolist())
 
-    def acting(self, normalisation: Normalisation) -> ActingPolicy:
+    @staticmethod
+    def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
         """See `Learner`."""
-        return NetworkActing(self.policy, normalisation)
+        return NetworkActing(policy, normalisation)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """See `Learner`."""

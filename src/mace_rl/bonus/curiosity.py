@@ -12,6 +12,7 @@ from mace_rl.bonus.novelty import novelty
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.finite import numbers
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.state import Stateful
 from mace_rl.streams import Streams
@@ -81,6 +82,7 @@ class Curiosity(Stateful, IntrinsicReward):
         states: float32 [N, observation]; visits: see `Novelty.continued`, if it goes on.
         """
         new = self.novelty(states) if visits is None else self.novelty.continued(states, visits)
+        new = numbers("the novelty", new, (len(states),))
         if self.memory is None:
             return Bonus(new, new, np.ones(len(new)))
         if self.memory.neighbours is None:

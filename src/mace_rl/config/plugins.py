@@ -16,23 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check, short_repr
-
-
-def config_of_run(values: Any, origin: str, trust: bool) -> RunConfig:
-    """The configuration in a `run.json` or the like, which `origin` names.
-
-    Raises `ConfigError` if it cannot be used and, unless `trust`, if it names code from outside
-    this package; none of that has been imported then.
-    """
-    config = check(RunConfig, values, origin)
-    for key, text in ({} if trust else code_outside(values)).items():
-        raise ConfigError(
-            f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: if you trust it, "
-            "give --trust (in a program: trust=True)"
-        )
-    return config
+from mace_rl.config.section import ConfigError, short_repr
 
 
 def code_outside(settings: Any) -> dict[str, str]:
@@ -87,9 +71,12 @@ def make(
     except TypeError as error:
         raise ConfigError(f"{key} has {reference!r} with {arguments}: {error}") from None
     try:
-        return factory(*given, **arguments)
+        made = factory(*given, **arguments)
     except ConfigError as error:
         raise ConfigError(f"{key} has {reference!r}: {error}") from None
+    if not isinstance(made, kind):
+        raise ConfigError(f"{key} has {reference!r}, which returned {short_repr(made)}")
+    return made
 
 
 def import_module(reference: str, key: str) -> ModuleType:
@@ -100,8 +87,8 @@ def import_module(reference: str, key: str) -> ModuleType:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError(f"{module!r} is no module's name")
         return importlib.import_module(module)
-    except ImportError as error:
-        reason = " ".join(str(error).split())
+    except (ImportError, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
 
 

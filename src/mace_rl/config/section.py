@@ -44,7 +44,7 @@ Reference = Annotated[str, AfterValidator(_reference)]
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
-    """With lists for tuples and Python's numbers for NumPy's, as JSON would give it back."""
+    """With Python's numbers for NumPy's; `ValueError` for what JSON would not give back."""
     value = value.item() if getattr(value, "shape", None) == () else value
     if depth < 100 and isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: _plain(item, depth + 1) for key, item in value.items()}
@@ -60,8 +60,8 @@ def _plain(value: Any, depth: int = 0) -> Any:
 
 
 def _writable(values: dict[str, Any]) -> dict[str, Any]:
-    json.dumps(values, ensure_ascii=False).encode()  # ValueError for half a character, and the like
-    return values
+    # ValueError for half a character, and the like.
+    return dict(json.loads(json.dumps(values, ensure_ascii=False).encode()))
 
 
 # Of the user's own code and of environments: what trains is what run.json brings back.

@@ -10,18 +10,18 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict, Tuple
-from gymnasium.wrappers import FlattenObservation
+from gymnasium.spaces import Box
 
 from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
-from mace_rl.environments.spaces import Spaces, require_vectors
+from mace_rl.environments.spaces import Spaces
 from mace_rl.outlets import keep_open
 
 # Environments for which we have a faster class that behaves the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
-MOST_STEPS = 10**6  # of an episode: before it, noise is drawn for as many
+MOST_STEPS = 10**6  # of an episode: before it, noise is drawn for as many ...
+MOST_NOISE = 10**8  # ... for every number in an action
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def trying_out(what: str) -> Iterator[None]:
     except (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled) as error:
         reason = f"{what} needs a package that should be installed: {error}"
         raise ConfigError(" ".join(reason.split())) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         *_, (frame, line) = traceback.walk_tb(error.__traceback__)
         place = "" if frame.f_globals is globals() else f" ({frame.f_code.co_filename}:{line})"
         reason = f"{what}: {type(error).__name__}: {error}{place}"
@@ -91,15 +91,17 @@ class Environment(Spaces):
             )
         with trying_out(f"environment {name!r}{f' with {arguments}' if arguments else ''}"):
             self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
-        self.given_space = self.env.observation_space  # that of what it gives, before `encode`
-        if isinstance(self.given_space, Tuple | Dict):
-            require_vectors(name, self.given_space, parts=True)
-            self.env = FlattenObservation(self.env)
-        super().__init__(name, self.env.observation_space, self.env.action_space)
+            spaces = self.env.observation_space, self.env.action_space
+        super().__init__(name, *spaces)
         if isinstance(self.action_space, Box) and self.action_space.dtype.kind != "f":
             raise ConfigError(
                 f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "
                 "policy gives fractions; make them Discrete, or a Box of floats"
+            )
+        if isinstance(self.action_space, Box) and self.max_steps * self.action_size > MOST_NOISE:
+            raise ConfigError(
+                f"environment {name!r} has {self.action_size} numbers in an action, and its "
+                f"time limit is {self.max_steps}, not up to {MOST_NOISE // self.action_size}"
             )
         # A Bullet environment's first reset averages the robot's position over one part fewer than
         # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh

@@ -13,17 +13,18 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 
 EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
-OFFERED = "load_state_dict"  # by an environment, beside `state_dict`
+OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermost of its wrappers
 
 
 def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
     """All that can be known of what the next episode depends on: the environment's generator, what
     its own `state_dict()` says if it has one, and the generators `of_process`, which takes longer.
     """
-    inner: Any = environment.env.unwrapped
+    env: Any = environment.env
+    offers = all(map(env.has_wrapper_attr, OFFERED))
     state = {
         "np_random": _plain(environment.generator.bit_generator.state),
-        "own": copy.deepcopy(inner.state_dict()) if hasattr(inner, OFFERED) else None,
+        "own": copy.deepcopy(env.get_wrapper_attr("state_dict")()) if offers else None,
     }
     if of_process:
         state["random"] = random.getstate()
@@ -34,9 +35,9 @@ def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any
 
 def set_state(environment: Environment, state: dict[str, Any]) -> None:
     """Let environment and process go on from what `state_of` returned."""
-    inner: Any = environment.env.unwrapped
+    env: Any = environment.env
     if state["own"] is not None:
-        inner.load_state_dict(copy.deepcopy(state["own"]))
+        env.get_wrapper_attr("load_state_dict")(copy.deepcopy(state["own"]))
     environment.generator.bit_generator.state = state["np_random"]
     if "random" in state:
         random.setstate(state["random"])

@@ -3,6 +3,7 @@
 And what an environment gives is checked here, as it comes in.
 """
 
+from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -26,7 +27,10 @@ class Spaces:
     def __init__(
         self, name: str, observations: gymnasium.Space[Any], actions: gymnasium.Space[Any]
     ) -> None:
-        require_vectors(name, observations)
+        require_vectors(name, observations, parts=isinstance(observations, Dict | Tuple))
+        self.given_space = observations  # of what `encode` gets
+        if isinstance(observations, Dict | Tuple):
+            observations = gymnasium.spaces.flatten_space(observations)
         if not (
             isinstance(actions, Discrete) or (isinstance(actions, Box) and len(actions.shape) == 1)
         ):
@@ -47,7 +51,7 @@ class Spaces:
         step: after which it came, for messages; 0 is the reset. Raises `ConfigError` for what is
         not of the space, and `NonFiniteError` for numbers that nothing can be learned from.
         """
-        space, given = self.observation_space, np.asarray(observation)
+        space, given = self.observation_space, _array(observation, self.given_space)
         if isinstance(space, Discrete):
             number = _only(given)
             place = -1 if number is None or number % 1 else int(number) - int(space.start)
@@ -65,7 +69,7 @@ class Spaces:
             return vector
         raise ConfigError(
             f"environment {self.name!r} gave the observation {short_repr(observation)} of shape "
-            f"{given.shape}{_after(step)}, but its observation_space is {space}"
+            f"{given.shape}{_after(step)}, but its observation_space is {self.given_space}"
         )
 
     def number(self, what: str, value: Any, step: int) -> float:
@@ -75,7 +79,7 @@ class Spaces:
         """
         if type(value) is float or type(value) is bool:
             return value
-        if (found := _only(np.asarray(value))) is None:
+        if (found := _only(_array(value))) is None:
             raise ConfigError(
                 f"environment {self.name!r} gave {short_repr(value)} as {what}{_after(step)}, but "
                 "it should be one number, or True or False"
@@ -114,6 +118,31 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
             f"environment {name!r} has {size} numbers in {short_repr(space)}; 1 to"
             f" {MOST_NUMBERS} work"
         )
+
+
+def _array(given: Any, space: gymnasium.Space[Any] | None = None) -> np.ndarray:
+    """As an array, of a Dict or Tuple a vector; without a number if it is none."""
+    # So say NumPy, PyTorch and Gymnasium that it is none.
+    with suppress(AttributeError, LookupError, TypeError, ValueError, RuntimeError):
+        if not isinstance(space, Dict | Tuple):
+            return np.asarray(given)
+        if _has_parts(given, space):
+            return np.asarray(gymnasium.spaces.flatten(space, given))
+    return np.empty((), object)
+
+
+def _has_parts(given: Any, space: gymnasium.Space[Any]) -> bool:
+    """Whether each part is of its size and each state known: `flatten` takes -1 for the last."""
+    match space:
+        case Dict():
+            return all(_has_parts(given[name], part) for name, part in space.items())
+        case Tuple():
+            return len(given) == len(space) and all(map(_has_parts, given, space))
+        case Discrete():
+            return bool(space.start <= given < space.start + space.n)
+        case MultiDiscrete():
+            return given in space
+    return np.size(given) == gymnasium.spaces.flatdim(space)
 
 
 def _only(values: np.ndarray) -> Any:

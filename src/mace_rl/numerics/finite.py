@@ -1,6 +1,7 @@
 """Numbers that go bad stop the run."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,15 @@ def require_finite(
         bad = found[~(abs(found) < too_large)].ravel()[0]
         why = f", but float32 learns from less than {too_large:g}: use a larger unit"
         raise NonFiniteError(f"{name} is {bad:.6g}{where}{why if math.isfinite(bad) else ''}")
+
+
+def numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """`values` as float64; `NonFiniteError` unless they are numbers in an array of this `shape`."""
+    found = np.asarray(values)
+    if found.shape != shape or found.dtype.kind not in "biuf":
+        wrong = f"{found.dtype} of shape {found.shape}"
+        raise NonFiniteError(f"{name} is {wrong}, but should be numbers of shape {shape}")
+    return found.astype(np.float64, copy=False)
 
 
 def require_within(

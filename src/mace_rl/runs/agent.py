@@ -10,20 +10,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 from torch import Tensor
 from torch.distributions import Distribution
 
 from mace_rl import files
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
-from mace_rl.agent.ppo import PPO
+from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
-from mace_rl.config.plugins import config_of_run
-from mace_rl.environments.environment import Environment
+from mace_rl.config.run import RunConfig
+from mace_rl.factories import actor_critic, environment
 from mace_rl.numerics.normaliser import Normalisation
-from mace_rl.runs.checkpoint import CheckpointError, unarchive
+from mace_rl.runs.checkpoint import CheckpointError
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
-from mace_rl.runs.provenance import file_digest, read_record
-from mace_rl.trainer import Trainer
+from mace_rl.streams import Streams
 
 
 class PolicyModule(TorchPolicy):
@@ -33,10 +34,11 @@ class PolicyModule(TorchPolicy):
     std: Tensor
     clip: Tensor
 
-    def __init__(self, trainer: Trainer) -> None:
-        super().__init__(trainer.ppo.policy)
-        ppo, self.space = trainer.ppo, trainer.environment.given_space
-        mean, std, clip = ppo.normalisation()
+    def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
+        """space: that of what the environment gives."""
+        super().__init__(networks.policy)
+        self.space = space
+        mean, std, clip = networks.normalisation()
         self.register_buffer("mean", torch.from_numpy(mean.copy()))
         self.register_buffer("std", torch.from_numpy(std.copy()))
         self.register_buffer("clip", torch.from_numpy(np.array(clip)))
@@ -55,12 +57,11 @@ class PolicyModule(TorchPolicy):
 class Agent(torch.nn.Module):
     """The policy and the critics, whose inputs are observations normalised as the policy's."""
 
-    def __init__(self, trainer: Trainer) -> None:
+    def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
         super().__init__()
-        self.policy, ppo = PolicyModule(trainer), trainer.ppo
-        self.critics = torch.nn.ModuleDict(
-            {kind: critic.module() for kind, critic in ppo.critics.items()}
-        )
+        self.policy = PolicyModule(networks, space)
+        critics = {kind: critic.module() for kind, critic in networks.critics.items()}
+        self.critics = torch.nn.ModuleDict(critics)
 
 
 @dataclass(frozen=True)
@@ -75,66 +76,59 @@ class MostProbable(NetworkActing):
 
 
 def load_agent(directory: str | Path, trust: bool = False) -> Agent:
-    """The agent of the finished run in `directory`. Raises what `restored` raises."""
-    return restored(Path(directory), trust)[1]
-
-
-def load_acting(
-    directory: Path, deterministic: bool = False, trust: bool = False
-) -> tuple[Environment, ActingPolicy]:
-    """The environment of the finished run in `directory`, and its policy for rollouts.
-
-    That samples its actions, or if `deterministic` takes the most probable ones. Raises what
-    `restored` raises.
-    """
-    trainer, agent = restored(directory, trust)
-    policy, loaded = trainer.ppo.policy, agent.policy
-    policy.network.load_module_state(loaded.network.state_dict())
-    if not policy.discrete:
-        policy.log_std[:] = loaded.log_std.detach().numpy()
-    mean, std, clip = loaded.mean.numpy(), loaded.std.numpy(), float(loaded.clip)
-    return trainer.environment, acting(
-        trainer.ppo, Normalisation.of(mean, std, clip), deterministic
-    )
-
-
-def acting(ppo: PPO, normalisation: Normalisation, deterministic: bool) -> ActingPolicy:
-    """The policy for rollouts: it samples its actions, or takes the most probable ones."""
-    if deterministic:
-        return MostProbable(ppo.policy, normalisation)
-    return ppo.learner.acting(normalisation)
-
-
-def restored(directory: Path, trust: bool) -> tuple[Trainer, Agent]:
-    """The trainer of the finished run in `directory` as it began, and the agent that came of it.
+    """The agent of the finished run in `directory`.
 
     Nothing in the files is executed, and of the code that they name only this package's unless
-    `trust`: `ConfigError`. Raises `CheckpointError` if `agent.pt` is not the file that `run.json`
-    describes, or has something else than weights of such an agent, and `ProvenanceError` if
-    `run.json` is damaged.
+    `trust`: `ConfigError`. Raises `CheckpointError` if `agent.pt` has something else than weights
+    of such an agent, and what the parts of a `FinishedRun` raise.
     """
-    record = read_record(directory / files.RECORD)
-    config = config_of_run(record["config"], str(directory / files.RECORD), trust)
-    path = directory / files.AGENT
-    if not path.exists() or file_digest(path) != record["outputs"][files.AGENT]:
-        raise CheckpointError(f"{path}: missing, cut off or altered (SHA-256 not as in run.json)")
-    state = unarchive(path.read_bytes(), path)
-    trainer = Trainer(config)
-    agent = Agent(trainer)
-    wanted = agent.state_dict()
-    for name in [*wanted, *state]:
-        found, right = _kind(state.get(name)), _kind(wanted.get(name))
-        if found != right:
-            raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
-        bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
-        if bad.any():
-            raise CheckpointError(f"{path}: {name} has NaN or Inf in it")
-    agent.load_state_dict(state)
-    return trainer, agent
+    return Player.of(FinishedRun(directory, trust)).agent
+
+
+class Player:
+    """The environment of a run and its agent, without what trains that; untrained at first."""
+
+    def __init__(self, config: RunConfig) -> None:
+        streams = Streams(config.seed)
+        self.environment = environment(config, streams)
+        self.networks = actor_critic(config, self.environment, config.bonus is not None, streams)
+        self.agent = Agent(self.networks, self.environment.given_space)
+
+    @classmethod
+    def of(cls, run: FinishedRun) -> "Player":
+        """With the agent that came of `run`; raises what `load_agent` raises."""
+        player = cls(run.config)
+        player._load(run.agent_state, run.folder / files.AGENT)
+        return player
+
+    def _load(self, state: dict[str, Any], path: Path) -> None:
+        wanted = self.agent.state_dict()
+        for name in [*wanted, *state]:
+            found, right = _kind(state.get(name)), _kind(wanted.get(name))
+            if found != right:
+                raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
+            bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
+            bad |= (state[name] <= 0) & (name in ("policy.std", "policy.clip"))
+            if bad.any():
+                raise CheckpointError(f"{path}: {name} has NaN or Inf in it, or is not positive")
+        self.agent.load_state_dict(state)
+        policy, loaded = self.networks.policy, self.agent.policy
+        policy.network.load_module_state(loaded.network.state_dict())
+        if not policy.discrete:
+            policy.log_std[:] = loaded.log_std.detach().numpy()
+
+    def acting(self, deterministic: bool) -> ActingPolicy:
+        """Its policy for rollouts: it samples its actions, or takes the most probable ones."""
+        policy, module = self.networks.policy, self.agent.policy
+        mean, std, clip = module.mean.numpy(), module.std.numpy(), float(module.clip)
+        normalisation = Normalisation.of(mean, std, clip)
+        if deterministic:
+            return MostProbable(policy, normalisation)
+        return self.networks.learner_of.acting(policy, normalisation)
 
 
 def _kind(entry: Any) -> str:
     """What an entry of a state is, without its values."""
     if isinstance(entry, Tensor):
-        return f"{entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
+        return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
     return "missing" if entry is None else f"a {type(entry).__name__}"

@@ -60,7 +60,8 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
                 raise ValueError("it is compressed")
         return dict(torch.load(io.BytesIO(data), weights_only=True))
     except Exception as error:  # torch reports damage by many types
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        # Of PyTorch's advice to trust it, with colours, not more than the first sentence.
+        reason = str(error).splitlines()[0].partition(". ")[0] if str(error) else repr(error)
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
 
 
@@ -88,16 +89,3 @@ def read(path: Path) -> dict[str, Any]:
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
     return unarchive(data, path)
-
-
-def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
-    """The first key in which two nested dictionaries differ, with both values."""
-    for key in [*wanted, *(key for key in found if key not in wanted)]:
-        name = f"{prefix}{key}"
-        old, new = found.get(key), wanted.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            if old != new:
-                return difference(old, new, f"{name}.")
-        elif old != new:
-            return f"{name} was {old!r} and is {new!r}"
-    return "no difference"

@@ -6,7 +6,8 @@ import numpy as np
 
 from mace_rl.environments.rollout import draw_noise, rollout_for
 from mace_rl.numerics.arrays import total
-from mace_rl.runs.agent import load_acting
+from mace_rl.runs.agent import Player
+from mace_rl.runs.finished import FinishedRun
 
 
 def evaluate(
@@ -17,7 +18,8 @@ def evaluate(
     It acts as it did in training, by sampling, or if `deterministic` by its most probable actions.
     Environment and actions draw from `seed`: the environment the same either way.
     """
-    environment, policy = load_acting(directory, deterministic, trust)
+    player = Player.of(FinishedRun(directory, trust))
+    environment, policy = player.environment, player.acting(deterministic)
     rollout = rollout_for(environment, policy)
     generator = np.random.default_rng(seed)
     environment.env.reset(seed=seed)

@@ -15,11 +15,8 @@ from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint
-from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.records import RecordError
-
-# Of a run's tables: the prefix of their tags, and what they are called in a checkpoint.
-TABLES = {files.EPISODES: ("episodes", "records"), files.DIAGNOSTICS: ("updates", "diagnostics")}
 
 
 def write_all(folder: Path, out: Path) -> int:
@@ -65,24 +62,17 @@ def write(run: Path, out: Path) -> None:
 def read(run: Path) -> dict[str, pd.DataFrame]:
     """The tables of a run by the prefix of their tags: its files, or what its checkpoint has.
 
-    A kept run may be without `diagnostics.csv`. Raises `RecordError` if a file is not the one that
-    `run.json` describes, `CheckpointError` and `ProvenanceError` for other damage.
+    Raises `CheckpointError` for a damaged checkpoint, and what the parts of a `FinishedRun` raise.
     """
-    if not (run / files.RECORD).exists():
-        state = checkpoint.read(run / files.CHECKPOINT)["state"]["trainer"]
-        return {
-            prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
-            for prefix, key in TABLES.values()
-        }
-    digests = read_record(run / files.RECORD)["outputs"]
-    tables = {}
-    for name, (prefix, _) in TABLES.items():
-        path = run / name
-        if path.exists() and file_digest(path) == digests.get(name):
-            tables[prefix] = pd.read_csv(path)
-        elif path.exists() or name == files.EPISODES:
-            raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
-    return tables
+    if (run / files.RECORD).exists():
+        finished = FinishedRun(run)
+        tables = {"episodes": finished.episodes, "updates": finished.diagnostics}
+        return {prefix: table for prefix, table in tables.items() if table is not None}
+    state = checkpoint.read(run / files.CHECKPOINT)["state"]["trainer"]
+    return {
+        prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
+        for prefix, key in (("episodes", "records"), ("updates", "diagnostics"))
+    }
 
 
 def rows(tables: Mapping[str, pd.DataFrame]) -> list[tuple[int, dict[str, float]]]:

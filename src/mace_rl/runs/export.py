@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl import files
+from mace_rl.config.run import IDENTITY
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
-from mace_rl.runs.finished import read_rows
-from mace_rl.runs.provenance import file_digest, read_record
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.records import RecordError
 
 RUN = ("task", "algorithm", "seed")  # environment, variant, seed
@@ -27,22 +27,16 @@ def columns(folder: Path) -> dict[str, list[Any]]:
     """
     table: dict[str, list[Any]] = {name: [] for name in (*RUN, *EPISODE)}
     seen: dict[tuple[Any, ...], Path] = {}
-    for run in files.runs_below(folder, [files.RECORD]):
-        record, episodes = read_record(run / files.RECORD), run / files.EPISODES
-        key = tuple(record["config"][name] for name in ("environment", "variant", "seed"))
+    for run in FinishedRun.below(folder):
+        key = tuple(run.record["config"][name] for name in IDENTITY)
         if key in seen:
             name = "{} {} seed {}".format(*key)
-            raise RecordError(f"{run}: {name} is in {seen[key]} too; export one of them alone")
-        seen[key] = run
-        if file_digest(episodes) != record["outputs"][files.EPISODES]:
-            raise RecordError(f"{episodes}: not the file that run.json describes (SHA-256 differs)")
-        rows = read_rows(episodes)
+            raise RecordError(f"{run.folder}: {name} is in {seen[key]} too; export one alone")
+        seen[key] = run.folder
         for name, value in zip(RUN, key, strict=True):
-            table[name] += [value] * len(rows)
+            table[name] += [value] * len(run.rows)
         for name, ours in EPISODE.items():
-            table[name] += [getattr(row, ours) for row in rows]
-    if not seen:
-        raise RecordError(f"{folder}: no finished run in it")
+            table[name] += [getattr(row, ours) for row in run.rows]
     return table
 
 

@@ -1,24 +1,132 @@
-"""Finished runs: whether a folder has one, and what it recorded."""
+"""A finished run on disk: what its folder holds, each part checked when it is first asked for."""
 
 import csv
+import hashlib
+import io
+from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from mace_rl import files
+from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError, check
-from mace_rl.runs.provenance import file_digest, read_record
-from mace_rl.runs.records import EpisodeRecord
+from mace_rl.config.section import ConfigError, check, short_repr
+from mace_rl.runs.provenance import difference, identity, read_record
+from mace_rl.runs.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 
+if TYPE_CHECKING:  # which take a second to import, as PyTorch does
+    import pandas as pd
+
+NEVER_WRITTEN = "not as a training writes it"
 WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
 
-def read_rows(path: Path) -> list[EpisodeRecord]:
-    """The `episodes.csv` of a run that is known to be whole, without pandas."""
-    types = get_type_hints(EpisodeRecord)
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(file)
-        return [EpisodeRecord(**{name: types[name](row[name]) for name in types}) for row in rows]
+class FinishedRun:
+    """The run that finished in `folder`; whoever asks for a part gets it whole, or a `Refusal`.
+
+    trust: whether its configuration may name code from outside this package.
+    """
+
+    def __init__(self, folder: str | Path, trust: bool = False) -> None:
+        self.folder, self.trust = Path(folder), trust
+
+    @classmethod
+    def below(cls, folder: Path, trust: bool = False) -> list["FinishedRun"]:
+        """Those in and below `folder`, sorted; `RecordError` if there are none."""
+        found = files.runs_below(folder, [files.RECORD])
+        if not found:
+            raise RecordError(f"no finished run in {folder}, or below it")
+        return [cls(one, trust) for one in found]
+
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """Its `run.json`; `ProvenanceError` if that is missing or damaged."""
+        return read_record(self.folder / files.RECORD)
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """Its configuration, to play or train by; none of the code that it names is imported.
+
+        Raises `ConfigError` if it cannot be used, or names code from outside without `trust`.
+        """
+        origin, values = str(self.folder / files.RECORD), self.record["config"]
+        config = check(RunConfig, values, origin)
+        for key, text in ({} if self.trust else code_outside(values)).items():
+            raise ConfigError(
+                f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: "
+                "if you trust it, give --trust (in a program: trust=True)"
+            )
+        return config
+
+    def content(self, name: str) -> bytes:
+        """One of `files.RESULTS`; `RecordError` if it is not the one that `run.json` describes."""
+        path = self.folder / name
+        content = path.read_bytes() if path.exists() else None
+        if content is None or hashlib.sha256(content).hexdigest() != self._digest(name):
+            raise RecordError(f"{path}: {ALTERED}")
+        return content
+
+    def _digest(self, name: str) -> str:
+        return str(self.record["outputs"].get(name))
+
+    def frame(self, episodes: int) -> "pd.DataFrame":
+        """`episodes.csv` with so many rows (`read_episodes`); `RecordError` names a bad line."""
+        path = self.folder / files.EPISODES
+        if not path.exists():
+            raise RecordError(f"{path}: {ALTERED}")
+        return read_episodes(path, episodes, self._digest(files.EPISODES))
+
+    @cached_property
+    def episodes(self) -> "pd.DataFrame":
+        """`frame` with the episodes that the run is configured to have."""
+        return self.frame(self.record["config"]["episodes"])
+
+    @cached_property
+    def rows(self) -> list[EpisodeRecord]:
+        """The same without pandas; `RecordError` names the file."""
+        types, content = get_type_hints(EpisodeRecord), self.content(files.EPISODES)
+        try:
+            lines = csv.DictReader(io.StringIO(content.decode(), newline=""))
+            rows = [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
+        except (KeyError, TypeError, ValueError, csv.Error):
+            rows = []
+        if len(rows) != self.record["config"]["episodes"]:
+            raise RecordError(f"{self.folder / files.EPISODES}: {NEVER_WRITTEN}")
+        return rows
+
+    @cached_property
+    def diagnostics(self) -> "pd.DataFrame | None":
+        """`diagnostics.csv`, numbers; a kept run may be without. `RecordError` names the file."""
+        import pandas as pd
+
+        path = self.folder / files.DIAGNOSTICS
+        content = io.BytesIO(self.content(path.name)) if path.exists() else None
+        try:
+            return pd.read_csv(content, dtype=float).astype({"episode": int}) if content else None
+        except (KeyError, ValueError):
+            raise RecordError(f"{path}: {NEVER_WRITTEN}") from None
+
+    @cached_property
+    def agent_state(self) -> dict[str, Any]:
+        """What is in `agent.pt`, plain data; `CheckpointError` if there is anything else."""
+        from mace_rl.runs.checkpoint import unarchive
+
+        return unarchive(self.content(files.AGENT), self.folder / files.AGENT)
+
+
+def read_runs(
+    records: Iterable[str], runs: Iterable[tuple[str, str, int, int]]
+) -> dict[RunKey, "pd.DataFrame"]:
+    """The episodes of each run.
+
+    records: their `run.json`s, each beside its `episodes.csv`; runs: for each its environment,
+    variant, seed and number of episodes. Raises what `FinishedRun.frame` raises.
+    """
+    return {
+        (environment, variant, seed): FinishedRun(Path(record).parent).frame(episodes)
+        for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True)
+    }
 
 
 def finished(config: RunConfig, directory: Path) -> bool:
@@ -29,28 +137,22 @@ def finished(config: RunConfig, directory: Path) -> bool:
     """
     if not (directory / files.RECORD).exists():
         return False
-    content = read_record(directory / files.RECORD)
-    # PyTorch takes seconds.
-    from mace_rl.runs.run import run_identity
-
-    wanted = run_identity(config)
-    found = {key: content[key] for key in wanted}
-    found["config"] = check(RunConfig, found["config"], str(directory / files.RECORD)).settings()
+    run = FinishedRun(directory, trust=True)  # nothing of it is run: it is compared
+    wanted = identity(config)
+    found = {key: run.record[key] for key in wanted} | {"config": run.config.settings()}
     if found != wanted:
         what = f"a finished run {otherwise(found, wanted, config)}"
         raise ConfigError(f"{directory} holds {what}; {WAY_OUT}")
-    for path in (directory / name for name in files.RESULTS):
-        if not path.exists() or file_digest(path) != content["outputs"].get(path.name):
-            raise ConfigError(
-                f"{path}: missing, cut off or altered (SHA-256 not as in run.json); {WAY_OUT}"
-            )
+    try:
+        for name in files.RESULTS:
+            run.content(name)
+    except RecordError as error:
+        raise ConfigError(f"{error}; {WAY_OUT}") from None
     return True
 
 
 def otherwise(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
     """In words, how the run with the identity `found` differs from the `wanted` one of `config`."""
-    from mace_rl.runs.checkpoint import difference
-
     code = " or ".join([*config.references().values(), "mace_rl"])
     only_code = found | {"sources": wanted["sources"]} == wanted
     return f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Space, Tuple, flatten
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from torch import Tensor
 
 from mace_rl.config.section import short_repr
@@ -26,7 +26,7 @@ def encoded(given: Any, space: Space[Any], size: int) -> Tensor:
         # Of what has another form gymnasium, numpy, torch and we ourselves say so.
         with suppress(TypeError, ValueError, LookupError, RuntimeError):
             found = read(given, space)
-            if found.shape[-1:] == (size,) and found.isfinite().all():
+            if found.shape[-1:] == (size,) and found.numel() and found.isfinite().all():
                 return found
     shape = f" of shape {tuple(given.shape)}" if hasattr(given, "shape") else ""
     what = f"{short_repr(given)}{shape}, which is no finite observation of {space}"
@@ -55,8 +55,10 @@ def _as_given(given: Any, space: Space[Any]) -> Tensor:
             one_hot = numbers[..., None].double() == states
             if _are_states(numbers) and one_hot.any(-1).all():
                 return one_hot.float()
-        case _ if given in space:
-            return torch.from_numpy(np.asarray(flatten(space, given))).float()
+        case MultiDiscrete(), _:
+            each = zip(space.nvec.ravel(), space.start.ravel(), strict=True)
+            parts = _numbers(given).flatten(-space.nvec.ndim).unbind(-1)
+            return _as_given(parts, Tuple([Discrete(n, start=start) for n, start in each]))
     raise ValueError
 
 

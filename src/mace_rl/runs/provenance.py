@@ -10,9 +10,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from mace_rl import sources
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
+from mace_rl.config.section import check, short_repr
 from mace_rl.refusal import Refusal
 
 # The packages whose version can change a result.
@@ -26,8 +29,25 @@ PACKAGES = (
     "pybullet",
     "pybullet-envs-gymnasium",
 )
-# What every run.json has.
-KEYS = {"config", "versions", "sources", "machine", "outputs"}
+
+
+class RecordedConfig(BaseModel):
+    """What every configuration in a run.json has; the rest may be of another version's."""
+
+    environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # cells of the table of `export`
+    variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
+    seed: int
+    episodes: int
+
+
+class RunRecord(BaseModel):
+    """What every run.json has."""
+
+    config: RecordedConfig
+    versions: dict[str, str]
+    sources: str
+    machine: dict[str, Any]
+    outputs: dict[str, str]
 
 
 class GitError(Refusal, RuntimeError):
@@ -38,12 +58,28 @@ class ProvenanceError(Refusal, ValueError):
     """A `run.json` that cannot be trusted; the message names it."""
 
 
-def sources_of(config: RunConfig) -> str:
-    """The digest of all code that a run depends on, the user's own included."""
+def identity(config: RunConfig) -> dict[str, Any]:
+    """What two runs have in common that give the same results, and continue each other's."""
     named = config.references().items()
-    return sources.digest(
-        "training", *(file for key, name in named for file in source_files(name, key))
-    )
+    own = (file for key, name in named for file in source_files(name, key))
+    return {
+        "config": config.settings(),
+        "versions": versions(),
+        "sources": sources.digest("training", *own),  # the user's own code included
+    }
+
+
+def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
+    """The first key in which two nested dictionaries differ, with both values."""
+    for key in [*wanted, *(key for key in found if key not in wanted)]:
+        name = f"{prefix}{key}"
+        old, new = found.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            if old != new:
+                return difference(old, new, f"{name}.")
+        elif old != new:
+            return f"{name} was {short_repr(old)} and is {short_repr(new)}"
+    return "no difference"
 
 
 def file_digest(path: Path) -> str:
@@ -116,12 +152,12 @@ def machine() -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A `run.json`; `ProvenanceError` if it is not whole."""
+    """A `run.json`; `ProvenanceError` if there is none, `ConfigError` if it lacks something."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        missing = KEYS - set(record)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, TypeError) as error:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ProvenanceError(f"no finished run in {path.parent}: it has no {path.name}") from None
+    except (OSError, ValueError, RecursionError) as error:
         raise ProvenanceError(f"{path}: not readable: {error}") from None
-    if missing:
-        raise ProvenanceError(f"{path}: the key {min(missing)!r} is missing")
+    check(RunRecord, record, str(path))
     return record

@@ -7,7 +7,7 @@ the line, because a damaged record would otherwise become a plausible number in 
 import csv
 import hashlib
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, TypeVar, get_type_hints
 
 import numpy as np
 
-from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
-from mace_rl.runs.provenance import read_record
 
 if TYPE_CHECKING:  # pandas is imported where a frame is built: training only writes
     import pandas as pd
@@ -88,6 +86,9 @@ def as_rows(kind: type[Row], columns: Mapping[str, np.ndarray]) -> list[Row]:
 _BOUND = {int: 2**53, float: np.inf}  # of a number's size: an int is exact as a double
 
 
+ALTERED = "missing, cut off or altered (SHA-256 not as in run.json)"
+
+
 class RecordError(Refusal, ValueError):
     """A result file that cannot be trusted; the message names the file and the line."""
 
@@ -131,23 +132,6 @@ def read_episodes(path: str | Path, episodes: int, digest: str | None = None) ->
     return frame
 
 
-def read_runs(
-    records: Iterable[str], runs: Iterable[tuple[str, str, int, int]]
-) -> dict[RunKey, "pd.DataFrame"]:
-    """The episodes of each run (`read_episodes`).
-
-    records: their `run.json`s, each beside its `episodes.csv`; runs: for each its environment,
-    variant, seed and number of episodes. Raises `RecordError` and `ProvenanceError` for what is
-    not what training wrote.
-    """
-    frames = {}
-    for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
-        digest = read_record(Path(record))["outputs"][files.EPISODES]
-        path = Path(record).with_name(files.EPISODES)
-        frames[environment, variant, seed] = read_episodes(path, episodes, digest)
-    return frames
-
-
 def read_table(
     path: str | Path, columns: Mapping[str, type], digest: str | None = None
 ) -> "pd.DataFrame":
@@ -185,7 +169,7 @@ def read_table(
     except (ValueError, OverflowError, csv.Error):
         whole = False  # the first line that is wrong is named below
     if whole and digest and not known:
-        raise RecordError(f"{path}: not the file that run.json describes (SHA-256 differs)")
+        raise RecordError(f"{path}: {ALTERED}")
     if whole:
         return frame
     for number, line in enumerate(lines[1:], start=2):

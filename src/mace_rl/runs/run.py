@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,28 +76,24 @@ def run(
             (directory / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
             return
         started = time.monotonic()
-        identity = run_identity(config)
+        identity = provenance.identity(config)
         trainer = Trainer(config)
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # what is there stays: the collector need not look through it again
-        before, saving, interruptions = resume(trainer, state)
+        clock = Clock(started, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
+        if state is not None:
+            resume(trainer, clock, state)
         checkpoint.require_plain(trainer.state_dict(), "state")  # not when it is late
-        progress_seconds = OBSERVER_SECONDS if observe else PROGRESS_SECONDS
-        clock = Clock(started - before, progress_seconds, saving)
-        observe = observe or partial(write_progress, directory)
+        told = directory / files.PROGRESS
+        observe = observe or (lambda progress: write_atomically(told, json.dumps(progress)))
 
         def save() -> None:
-            state = {
-                "trainer": trainer.state_dict(),
-                "seconds": clock.elapsed(),
-                "checkpoint_seconds": clock.checkpoint_seconds,
-                "interruptions": interruptions,
-                "machine": provenance.machine(),
-            }
-            checkpoint.save(directory / files.CHECKPOINT, identity, state)
+            with clock.saving():
+                state = {"trainer": trainer.state_dict(), **clock.account()}
+                checkpoint.save(directory / files.CHECKPOINT, identity, state)
 
         for records in trainer.run():
             if after_episode:
@@ -109,24 +104,13 @@ def run(
             if clock.progress_due():
                 observe(how_far(trainer, clock))
             if clock.checkpoint_due():
-                with clock.saving():
-                    save()
-        if keep_checkpoint:
-            with clock.saving():
                 save()
-        write_results(directory, trainer, identity, clock, interruptions)
+        if keep_checkpoint:
+            save()
+        write_results(directory, trainer, identity, clock)
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
-        (directory / files.PROGRESS).unlink(missing_ok=True)
-
-
-def run_identity(config: RunConfig) -> dict[str, Any]:
-    """What must be equal for a checkpoint to be continued."""
-    return {
-        "config": config.settings(),
-        "versions": provenance.versions(),
-        "sources": provenance.sources_of(config),
-    }
+        told.unlink(missing_ok=True)
 
 
 def to_continue(
@@ -166,17 +150,13 @@ def to_continue(
     return content["state"] if content else None
 
 
-def resume(
-    trainer: Trainer, state: dict[str, Any] | None
-) -> tuple[float, float, list[dict[str, Any]]]:
-    """Continue from the state in a checkpoint, if there is one.
+def resume(trainer: Trainer, clock: "Clock", state: dict[str, Any]) -> None:
+    """Continue from the state in a checkpoint.
 
-    Returns the seconds already spent, those of them on checkpoints, and for each interruption so
-    far the episode after which the run was continued, the machine that had done the part before,
-    and whether the environment played the last episodes before it again, as it should.
+    An interruption is told by the episode after which the run was continued, the machine that had
+    done the part before, and whether the environment played the last episodes before it again, as
+    it should.
     """
-    if state is None:
-        return 0.0, 0.0, []
     differs = resuming.replay_differs(trainer.environment, state["trainer"]["last_episodes"])
     trainer.load_state_dict(state["trainer"])  # also what the replay drew from
     logger.info("resuming after episode %d", len(trainer.records))
@@ -191,21 +171,32 @@ def resume(
         "machine": state["machine"],
         "environment_replayed": not differs,
     }
-    interruptions = [*state["interruptions"], interruption]
-    return state["seconds"], state["checkpoint_seconds"], interruptions
+    clock.start -= state["seconds"]
+    clock.checkpoint_seconds = state["checkpoint_seconds"]
+    clock.interruptions = [*state["interruptions"], interruption]
 
 
 class Clock:
     """Training time, and when progress and checkpoints are due; seconds."""
 
-    def __init__(self, start: float, progress_seconds: float, spent: float = 0.0) -> None:
-        self.start = start
+    def __init__(self, start: float, progress_seconds: float) -> None:
+        self.start = start  # by `time.monotonic`, as if there had been no interruption
         self.start_seconds = 0.0  # of this process until its first episodes were over
         self.progress_seconds = progress_seconds
         self.next_progress = time.monotonic()
         self.between_checkpoints = between_checkpoints()
         self.next_checkpoint = time.monotonic() + self.between_checkpoints
-        self.checkpoint_seconds = spent  # on checkpoints
+        self.checkpoint_seconds = 0.0  # spent on checkpoints
+        self.interruptions: list[dict[str, Any]] = []
+
+    def account(self) -> dict[str, Any]:
+        """What a checkpoint and `run.json` have of the training's course."""
+        return {
+            "seconds": self.elapsed(),
+            "checkpoint_seconds": self.checkpoint_seconds,
+            "interruptions": self.interruptions,
+            "machine": provenance.machine(),
+        }
 
     def elapsed(self) -> float:
         """Seconds of this run, those before interruptions included."""
@@ -247,11 +238,14 @@ def between_checkpoints() -> float:
 
 @contextmanager
 def left_alone() -> Iterator[None]:
-    """One thread for PyTorch, and nothing frozen for the collector, when this is over as before."""
+    """PyTorch on one thread as it begins, and nothing frozen for the collector; then as before."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+            yield
+    except SystemExit as error:
+        raise RunError(f"code of a plugin ended the program: {error!r}") from error
     finally:
         torch.set_num_threads(threads)
         gc.unfreeze()
@@ -265,20 +259,16 @@ def exclusive(directory: Path) -> Iterator[int]:
         # A copy in an environment's worker would hold it when the training has ended.
         os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
-        while not locked(file.fileno()):
-            if time.monotonic() > patience:
-                raise RunError(f"{directory}: another process is training in this folder")
-            time.sleep(0.1)
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > patience:
+                    reason = "another process is training in this folder"
+                    raise RunError(f"{directory}: {reason}") from None
+                time.sleep(0.1)
         yield file.fileno()
-
-
-def locked(descriptor: int) -> bool:
-    """Try to lock an open file for this process."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
@@ -302,31 +292,19 @@ def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
     }
 
 
-def write_progress(directory: Path, progress: dict[str, Any]) -> None:
-    """Tell whoever watches the folder."""
-    write_atomically(directory / files.PROGRESS, json.dumps(progress))
-
-
 def write_results(
-    directory: Path,
-    trainer: Trainer,
-    identity: dict[str, Any],
-    clock: Clock,
-    interruptions: list[dict[str, Any]],
+    directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock
 ) -> None:
     """Write the records, the agent and, when those are safe, where they come from."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
-    agent = checkpoint.archive(Agent(trainer).state_dict())
+    agent = checkpoint.archive(Agent(trainer.ppo, trainer.environment.given_space).state_dict())
     write_atomically(directory / files.AGENT, agent)
     origin = identity | {
         "code": provenance.git_state(),
-        "machine": provenance.machine(),
         "threads": torch.get_num_threads(),
-        "seconds": clock.elapsed(),
+        **clock.account(),
         "start_seconds": clock.start_seconds,
-        "checkpoint_seconds": clock.checkpoint_seconds,
-        "interruptions": interruptions,
         "peak_memory_mb": provenance.peak_memory_mb(),
         "outputs": {name: provenance.file_digest(directory / name) for name in files.RESULTS},
     }

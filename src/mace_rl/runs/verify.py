@@ -10,48 +10,30 @@ from pathlib import Path
 
 import numpy as np
 
-from mace_rl import files
-from mace_rl.config.plugins import config_of_run
 from mace_rl.refusal import Refusal
-from mace_rl.runs.checkpoint import difference
-from mace_rl.runs.provenance import read_record
-from mace_rl.runs.records import RecordError, read_episodes
+from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.provenance import difference
 
 
 class NotReproducedError(Refusal):
     """Repeated runs are not equal to the bit."""
 
 
-def reference_runs(folder: Path) -> list[Path]:
-    """The run folders in and below `folder`, sorted; `RecordError` if there are none."""
-    runs = files.runs_below(folder, [files.RECORD])
-    if not runs:
-        raise RecordError(f"{folder}: no finished run in it")
-    return runs
-
-
-def repeat(run_folder: Path, trust: bool = False) -> tuple[bool, str]:
-    """Train as the `run.json` in `run_folder` says; whether records and agent are equal, in words.
-
-    Raises `RecordError` if the files there are not those that `run.json` describes.
-    """
+def repeat(then: FinishedRun) -> tuple[bool, str]:
+    """Train as `then` was; whether records and agent are equal, in words."""
     from mace_rl.runs.run import run  # PyTorch takes seconds to import
 
-    then = read_record(run_folder / files.RECORD)
-    config = config_of_run(then["config"], str(run_folder / files.RECORD), trust)
-    records = run_folder / files.EPISODES
-    before = read_episodes(records, config.episodes, then["outputs"][files.EPISODES])
+    config, before = then.config, then.episodes
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        run(config, folder)
-        now = read_record(folder / files.RECORD)
-        after = read_episodes(folder / files.EPISODES, config.episodes)
+        run(config, Path(temporary))
+        now = FinishedRun(temporary)
+        after = now.episodes
     name = f"{config.environment} {config.variant} seed {config.seed}"
-    if then["outputs"] == now["outputs"]:
+    if then.record["outputs"] == now.record["outputs"]:
         return True, f"{name}: equal to the bit"
     old, new = (
         {key: record[key] for key in ("versions", "sources")} | {"cpu": record["machine"]["cpu"]}
-        for record in (then, now)
+        for record in (then.record, now.record)
     )
     different = (before != after).any(axis=1).to_numpy()
     first = f"from episode {different.argmax() + 1}"
@@ -66,15 +48,16 @@ def repeat(run_folder: Path, trust: bool = False) -> tuple[bool, str]:
 def verify(folder: Path, sample: int | None, trust: bool = False) -> Iterator[str]:
     """Repeat `sample` runs of `folder` (None: all), at random but always the same; yields lines.
 
-    Raises `RecordError` for damaged files and `NotReproducedError` if a run is not reproduced.
+    Raises `NotReproducedError` if a run is not reproduced, and what the parts of a `FinishedRun`
+    raise.
     """
-    runs = reference_runs(folder)
+    runs = FinishedRun.below(folder, trust)
     if sample is not None and sample < len(runs):
         chosen = np.random.default_rng(0).choice(len(runs), sample, replace=False)
         runs = [runs[i] for i in sorted(chosen)]
     reproduced = 0
-    for run_folder in runs:
-        equal, line = repeat(run_folder, trust)
+    for run in runs:
+        equal, line = repeat(run)
         reproduced += equal
         yield line
     line = f"{reproduced} of {len(runs)} runs equal to the bit"

@@ -12,15 +12,11 @@ import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mace_rl import files
-from mace_rl.config.plugins import config_of_run
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
 from mace_rl.environments.rollout import draw_noise, roll_out
-from mace_rl.numerics.normaliser import Normalisation
-from mace_rl.runs.agent import acting, load_acting
-from mace_rl.runs.provenance import read_record
-from mace_rl.trainer import Trainer
+from mace_rl.runs.agent import Player
+from mace_rl.runs.finished import FinishedRun
 
 # pygame needs neither a screen nor a loudspeaker to draw into memory, and should not look for them.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -113,16 +109,12 @@ def film(
     """The first `episodes` that `evaluate` plays with the agent in `directory`, or `untrained`.
 
     The untrained agent is the same one before training: its initial weights, by the run's seed.
-    Raises what `restored` raises, and `RenderError` if the environment cannot be drawn.
+    Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
-    record = directory / files.RECORD
-    config = config_of_run(read_record(record)["config"], str(record), trust)
-    if untrained:
-        trainer = Trainer(config)
-        environment, ppo = trainer.environment, trainer.ppo
-        policy = acting(ppo, Normalisation.of(*ppo.normalisation()), deterministic)
-    else:
-        environment, policy = load_acting(directory, deterministic, trust)
+    run = FinishedRun(directory, trust)
+    config = run.config
+    player = Player(config) if untrained else Player.of(run)
+    environment, policy = player.environment, player.acting(deterministic)
     # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):

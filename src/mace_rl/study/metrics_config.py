@@ -27,7 +27,7 @@ class MetricsConfig(Section):
     convergence_slope: float = Field(ge=0, lt=1)  # of the steepest so far: diminishing returns
     convergence_band: float = Field(gt=0, lt=1)  # of the learning range, around the final return
     confidence: float = Field(gt=0, lt=1)  # of every interval
-    bootstrap_repetitions: int = Field(ge=100)
+    bootstrap_repetitions: int = Field(ge=100, le=10**6)
     bootstrap_seed: NonNegativeInt
     random_return: dict[str, float]  # mean return of uniformly random actions, per environment
     reference_return: dict[str, float] = Field(default={})  # sets one bar for all variants
@@ -106,6 +106,6 @@ class MetricsConfig(Section):
 class FigureConfig(Section):
     """How the figures are laid out."""
 
-    columns: PositiveInt  # panels side by side, one panel per environment
+    columns: int = Field(ge=1, le=100)  # panels side by side, one panel per environment
     # This share of the episodes once more, large, where most is learned in them; None: nowhere.
     inset: float | None = Field(default=None, gt=0, lt=1)

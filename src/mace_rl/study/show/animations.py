@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mace_rl import files
-from mace_rl.runs.provenance import read_record
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.watch import Film, RenderError, film, gif
 
 WIDTH, SECONDS = 200, 5.0  # a film of Hopper's then takes less than 400 kB
@@ -63,7 +63,7 @@ def _of_one(
     untrained: dict[bytes, tuple[Film, list[str]]] = {}
     trained = []
     for variant, folder in folders.items():
-        trust = read_record(folder / files.RECORD)["config"] in own
+        trust = FinishedRun(folder).record["config"] in own
         before = film(folder, untrained=True, trust=trust, width=WIDTH, seconds=SECONDS)
         untrained.setdefault(gif(before), (before, []))[1].append(variant)
         after = film(folder, trust=trust, width=WIDTH, seconds=SECONDS)

@@ -20,7 +20,7 @@ def page(title: str, origin: str, sections: Iterable[Section], pictures: Sequenc
 
 def markdown(frame: pd.DataFrame) -> str:
     """A table as Markdown."""
-    lines = [f"| {' | '.join(frame.columns)} |", "|---" * len(frame.columns) + "|"]
+    lines = [f"| {' | '.join(map(_markdown, frame.columns))} |", "|---" * len(frame.columns) + "|"]
     lines += [f"| {' | '.join(map(_markdown, row))} |" for row in frame.to_numpy()]
     return "\n".join(lines) + "\n"
 
