@@ -225,7 +225,7 @@ def test_a_damaged_result_is_named_on_the_terminal(finished: Project) -> None:
         ("--config sedes=[0]", "config.yaml: unknown key 'sedes'"),
         ("--configfile /nowhere.yaml", "/nowhere.yaml: cannot be read: No such file"),
         ("--configfiles config.yaml latin1.yaml", "latin1.yaml: cannot be read: it is not UTF-8"),
-        ("--config claims=config.yaml", "config.yaml: unknown key 'results'"),
+        ("--config claims=latin1.yaml", "config.yaml: latin1.yaml: cannot be read: it is"),
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
     ],
 )
