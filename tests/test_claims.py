@@ -21,7 +21,7 @@ from invented import (
 )
 
 from mace_rl.config.section import ConfigError
-from mace_rl.runs.records import RecordError
+from mace_rl.records import RecordError
 from mace_rl.study.claims_config import parts_of, read_claims
 from mace_rl.study.compare import verdicts
 from mace_rl.study.compare.ledger import Finding, read_ledger, to_json

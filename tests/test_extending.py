@@ -13,8 +13,8 @@ from invented import table_for_tables
 from shared import call
 
 from mace_rl.library import settings
+from mace_rl.records import read_episodes
 from mace_rl.runs.agent import load_agent
-from mace_rl.runs.records import read_episodes
 from mace_rl.study.claims_config import read_claims
 from mace_rl.study.compare.summary import split, summary
 from mace_rl.study.compare.verdicts import ledger

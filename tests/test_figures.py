@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from mace_rl.runs.records import RecordError
+from mace_rl.records import RecordError
 from mace_rl.study.config import read_study
 from mace_rl.study.metrics_config import FigureConfig
 from mace_rl.study.show.curves import (

@@ -8,9 +8,9 @@ import pytest
 from shared import GOOD, call
 
 from mace_rl import files
+from mace_rl.records import RecordError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import file_digest
-from mace_rl.runs.records import RecordError
 
 READ = {  # by the command
     "evaluate": [files.AGENT],

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mace_rl import files
+from mace_rl.records import rounded, write_episodes
 from mace_rl.runs.provenance import file_digest
-from mace_rl.runs.records import rounded, write_episodes
 from tools import kept_runs
 
 

@@ -21,8 +21,8 @@ from mace_rl import load_agent, settings, train
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics import compiling
+from mace_rl.records import read_episodes
 from mace_rl.refusal import Refusal
-from mace_rl.runs.records import read_episodes
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]

@@ -9,7 +9,7 @@ import pytest
 from invented import CONFIG, SETTINGS, frame, noisy
 
 from mace_rl.config.section import ConfigError, check
-from mace_rl.runs.records import RecordError, read_table
+from mace_rl.records import RecordError, read_table
 from mace_rl.study.measure import metrics as m
 from mace_rl.study.measure import run_metrics as t
 from mace_rl.study.metrics_config import GOALS, MetricsConfig

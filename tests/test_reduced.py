@@ -7,7 +7,7 @@ import pytest
 from invented import CLAIMS
 from shared import VARIANTS, finish
 
-from mace_rl.runs.records import EpisodeRecord, RunKey, as_columns
+from mace_rl.records import EpisodeRecord, RunKey, as_columns
 from mace_rl.study.compare.summary import split, summary
 from mace_rl.study.config import read_study
 from mace_rl.study.measure.run_metrics import metrics_table

@@ -222,7 +222,11 @@ def test_agents_that_do_the_same_untrained_share_a_film(
     runs = {("HopperBulletEnv-v0", variant): hopper / variant / "seed0" for variant in VARIANTS}
     labels = {variant: variant.upper() for variant in VARIANTS}
     before, *after = animations(runs, labels, made / "results")[0]["HopperBulletEnv-v0"]
-    assert (before.title, before.variants, before.trained) == ("Before training", VARIANTS, False)
+    assert (before.title, before.variants, before.trained) == (
+        "Before training",
+        tuple(VARIANTS),
+        False,
+    )
     assert [(one.title, one.variants, one.trained) for one in after] == [
         (labels[variant], (variant,), True) for variant in VARIANTS
     ]

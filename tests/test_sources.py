@@ -13,7 +13,7 @@ CHANGES = [  # of a file, and whether a training has other sources then
     ("agent/ppo.py", True),
     ("config/agent.py", True),
     ("study/measure/metrics.py", False),
-    ("runs/records.py", True),
+    ("records.py", True),
     ("study/show/report.py", False),
     ("a_new_file.py", True),
 ]

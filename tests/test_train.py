@@ -18,10 +18,10 @@ from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.config.reading import merge
 from mace_rl.experience import Experience
 from mace_rl.numerics.finite import NonFiniteError
+from mace_rl.records import EpisodeRecord
 from mace_rl.refusal import Refusal
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.runs.records import EpisodeRecord
 from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 

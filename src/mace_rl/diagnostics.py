@@ -10,7 +10,7 @@ from mace_rl.experience import Experience
 from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.numerics.products import dot
-from mace_rl.runs.records import UpdateRecord
+from mace_rl.records import UpdateRecord
 
 
 def unseen(normaliser: RunningNormaliser) -> list[int]:

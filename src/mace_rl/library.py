@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
+from mace_rl.records import EpisodeRecord
 from mace_rl.runs.finished import FinishedRun, finished
-from mace_rl.runs.records import EpisodeRecord
 from mace_rl.study.config import read_study
 
 if TYPE_CHECKING:

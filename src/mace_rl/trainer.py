@@ -33,8 +33,8 @@ from mace_rl.experience import (
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
+from mace_rl.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.refusal import Refusal
-from mace_rl.runs.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.streams import Streams
 
 logger = logging.getLogger(__name__)

@@ -9,9 +9,9 @@ from job import job
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.files import write_atomically
+from mace_rl.records import read_table
 from mace_rl.runs.finished import read_runs
 from mace_rl.runs.provenance import read_record
-from mace_rl.runs.records import read_table
 from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import types
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -156,3 +157,12 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
         return [one for argument in get_args(annotation) for one in _sections(argument)]
     is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
     return [annotation] if is_section else []
+
+
+def check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
+    """Refuse a name that is not among those `known`, which stand `where`."""
+    known = list(known)
+    if name not in known:
+        nearest = difflib.get_close_matches(name, known, n=1)
+        hint = f"; the nearest there is {nearest[0]!r}" if nearest else ""
+        raise ConfigError(f"{key} has {name!r}, which is not in {where}{hint}")

@@ -1,4 +1,4 @@
-"""Provenance environments: Gymnasium's registry, generators that resume."""
+"""Making environments: Gymnasium's registry, generators that resume."""
 
 import copy
 import os

@@ -13,10 +13,10 @@ import pandas as pd
 
 from mace_rl import files
 from mace_rl.files import write_atomically
+from mace_rl.records import RecordError
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint
 from mace_rl.runs.finished import FinishedRun
-from mace_rl.runs.records import RecordError
 
 
 def write_all(folder: Path, out: Path) -> int:

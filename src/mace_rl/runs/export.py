@@ -6,9 +6,9 @@ from typing import Any
 from mace_rl import files
 from mace_rl.config.run import IDENTITY
 from mace_rl.files import write_atomically
+from mace_rl.records import RecordError
 from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
-from mace_rl.runs.records import RecordError
 
 RUN = ("task", "algorithm", "seed")  # environment, variant, seed
 EPISODE = {  # our name of each other column; the step counts all of the run, this episode included

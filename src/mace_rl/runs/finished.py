@@ -12,8 +12,8 @@ from mace_rl import files
 from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
+from mace_rl.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 from mace_rl.runs.provenance import difference, identity, read_record
-from mace_rl.runs.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd

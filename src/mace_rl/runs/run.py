@@ -26,11 +26,11 @@ from mace_rl.config.run import RunConfig
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
+from mace_rl.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.finished import WAY_OUT, finished, otherwise
-from mace_rl.runs.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.trainer import Trainer
 
 logger = logging.getLogger(__name__)

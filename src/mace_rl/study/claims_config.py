@@ -8,17 +8,18 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
-from mace_rl.config.section import ConfigError, Section, check
-from mace_rl.environments import registered
-from mace_rl.study.config import Study, check_known
+from mace_rl.config.section import ConfigError, Section, check, check_known
 from mace_rl.study.measure.metrics import CORRELATION, METRICS, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
+
+if TYPE_CHECKING:  # imports Gymnasium, which tables do without
+    from mace_rl.study.config import Study
 
 Names = Annotated[list[str], Field(min_length=1)]
 
@@ -186,7 +187,7 @@ def parse_claims(path: str | Path) -> ClaimsConfig:
     return check(ClaimsConfig, read_yaml(Path(path)), str(path))
 
 
-def read_claims(study: Study, path: str | Path) -> ClaimsConfig:
+def read_claims(study: "Study", path: str | Path) -> ClaimsConfig:
     """The file that a study names, checked against it; a `ConfigError` with its first mistake."""
     claims = parse_claims(path)
     try:
@@ -197,8 +198,10 @@ def read_claims(study: Study, path: str | Path) -> ClaimsConfig:
     return claims
 
 
-def _check_names(claims: ClaimsConfig, study: Study) -> None:
+def _check_names(claims: ClaimsConfig, study: "Study") -> None:
     """Refuse a metric, variant, environment, way or setting that there is not."""
+    from mace_rl.environments import registered  # Gymnasium, which tables do without
+
     measured = all_metrics(study.metrics.within(study.environments, study.variants))
     metrics = [metric.name for metric in (*METRICS, *measured)]
     own = {*study.environments, *study.environment_settings}

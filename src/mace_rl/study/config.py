@@ -4,7 +4,6 @@
 module is imported whenever the workflow is planned, so it stays clear of torch and numba.
 """
 
-import difflib
 import importlib.util
 import itertools
 import re
@@ -22,7 +21,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from mace_rl.config.plugins import import_module, load, source_files
 from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
-from mace_rl.config.section import ConfigError, Section, check, explain, short_repr
+from mace_rl.config.section import ConfigError, Section, check, check_known, explain, short_repr
 from mace_rl.environments import registered
 from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig
 
@@ -302,12 +301,3 @@ def _check_environment(config: RunConfig) -> None:
             raise ConfigError(
                 f"{key} has {name!r}, but the package it needs should be installed: {reason}"
             ) from None
-
-
-def check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
-    """Refuse a name that is not among those `known`, which stand `where`."""
-    known = list(known)
-    if name not in known:
-        nearest = difflib.get_close_matches(name, known, n=1)
-        hint = f"; the nearest there is {nearest[0]!r}" if nearest else ""
-        raise ConfigError(f"{key} has {name!r}, which is not in {where}{hint}")

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from mace_rl.runs.records import RunKey
+from mace_rl.records import RunKey
 from mace_rl.study.claims_config import Table1Config
 from mace_rl.study.compare.statistics import logrank
 from mace_rl.study.compare.summary import summary

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from mace_rl.runs.records import RecordError
+from mace_rl.records import RecordError
 from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, FamilyConfig, Part, Table1Config
 from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import (

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from mace_rl.config.section import ConfigError
-from mace_rl.runs.records import RecordError, RunKey, read_table
+from mace_rl.records import RecordError, RunKey, read_table
 from mace_rl.study.measure.metrics import (
     Attained,
     LearningCurve,

@@ -19,7 +19,7 @@ import seaborn
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mace_rl.runs.records import RecordError, RunKey
+from mace_rl.records import RecordError, RunKey
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.measure.metrics import moving_average
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig

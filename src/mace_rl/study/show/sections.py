@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from mace_rl.runs.records import read_table
+from mace_rl.records import read_table
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.comparisons import ALL
 from mace_rl.study.compare.ledger import Answer, read_ledger
