@@ -1,7 +1,7 @@
 """What `make test-wheel` does in each environment: python outside.py PROJECT NAME.
 
 Only what somebody has who installed the wheel, in an empty folder: of PROJECT no file is used but
-its pages, whose examples are carried out.
+its pages, whose examples are carried out, and the plugins in extras/.
 """
 
 import importlib.util
@@ -9,6 +9,7 @@ import io
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
@@ -66,6 +67,7 @@ def main() -> None:
     for block in blocks(extending, "python") + blocks(extending, "yaml"):
         name = block.splitlines()[0].removeprefix("# ")
         Path(name).write_text(block, encoding="utf-8")
+    shutil.copytree(project / "extras", "extras")  # which the wheel does not have: the page says so
     for block in blocks(extending, "sh"):
         for command in re.findall(r"^mace-rl (train .*)$", block, re.MULTILINE):
             shell(f"{PYTHON} -m mace_rl {command}")

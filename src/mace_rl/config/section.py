@@ -66,7 +66,11 @@ def _writable(values: dict[str, Any]) -> dict[str, Any]:
 
 
 # Of the user's own code and of environments: what trains is what run.json brings back.
-Arguments = Annotated[dict[str, Annotated[Any, BeforeValidator(_plain)]], AfterValidator(_writable)]
+# (A lambda: pydantic 2.7 would give a second parameter something of its own.)
+Arguments = Annotated[
+    dict[str, Annotated[Any, BeforeValidator(lambda value: _plain(value))]],
+    AfterValidator(_writable),
+]
 
 
 def check(model: type[Model], values: Any, origin: str) -> Model:
