@@ -31,11 +31,11 @@ def cells(told: Mapping[str, Any]) -> dict[str, str]:
         "return": f"{told['recent_return']:.1f}",
         "β": f"{told['beta']:.2f}",
         "steps/s": "" if early else f"{told['steps_per_second']:.0f}",
-        "left": duration(left_alone(told)),
+        "left": duration(own_estimate(told)),
     }
 
 
-def left_alone(told: Mapping[str, Any]) -> float:
+def own_estimate(told: Mapping[str, Any]) -> float:
     """Seconds to a run's end by what it tells itself; NaN while that would be a guess.
 
     Its episodes become longer or shorter as the policy learns.
@@ -117,13 +117,13 @@ class Run:
         else:
             self.state = "stopped" if told else "waiting"
         if self.state == "running" and told:
-            self.seconds = told["seconds"] - told["start_seconds"] + left_alone(told)
+            self.seconds = told["seconds"] - told["start_seconds"] + own_estimate(told)
 
     def left(self, expected: float) -> float:
         """Seconds to its end: by what it tells, or while that is a guess if it takes `expected`."""
         if not self.told:
             return expected
-        known = left_alone(self.told)
+        known = own_estimate(self.told)
         spent = self.told["seconds"] - self.told["start_seconds"]
         return expected - spent if math.isnan(known) else known
 

@@ -71,7 +71,7 @@ def run(
     something is in the way, `ConfigError` if a finished run is.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    with exclusive(directory) as lock, threadpool_limits(1), left_alone():
+    with exclusive(directory) as lock, threadpool_limits(1), single_threaded():
         if aside == "nothing" and finished(config, directory):
             (directory / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
             return
@@ -237,7 +237,7 @@ def between_checkpoints() -> float:
 
 
 @contextmanager
-def left_alone() -> Iterator[None]:
+def single_threaded() -> Iterator[None]:
     """PyTorch on one thread as it begins, and nothing frozen for the collector; then as before."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
