@@ -79,12 +79,14 @@ def intrinsic_reward(
 
 def environment(config: RunConfig, streams: Streams) -> Environment:
     """What the agent acts in."""
-    return Environment(
+    made = Environment(
         config.environment,
         streams.sequence("environment"),
         config.max_episode_steps,
         config.environment_arguments,
     )
+    made.clips_actions = config.ppo.clip_actions
+    return made
 
 
 def actor_critic(

@@ -20,6 +20,7 @@ STREAMS = (
     "novelty",
     "beta",
     "bonus",
+    "dropout",
 )
 
 

@@ -80,14 +80,15 @@ class PPO(ActorCritic, Stateful):
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
         observations: normalised, [T + 1, observation]; rewards: [T], as they were paid. A terminal
-        state is worth 0; a state the time limit cut off at is worth what the critic says. With
+        state is worth 0; a state the time limit cut off at is worth what the critic says, unless
+        the settings say otherwise. With
         `scale_rewards` all is in units of the reward's scale, this episode included.
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
             rewards = rewards / self.reward_scale(kind)
         values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
-        if terminated:
+        if terminated or not self.config.bootstrap_at_time_limit:
             values[-1] = 0.0
         advantages = generalised_advantages(
             rewards, values, self.config.discount, self.config.gae_lambda

@@ -131,6 +131,7 @@ def film(
         )
     except ConfigError as error:  # it trains, so it is the mode that it does not take
         raise RenderError(f"{error}, so it cannot be drawn") from None
+    environment.clips_actions = config.ppo.clip_actions
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
     with closing(filmed), nothing_printed():
