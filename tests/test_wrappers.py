@@ -21,11 +21,11 @@ from extras.random_beta import RandomBeta
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.bonus.flag import FlagNovelty
 from mace_rl.config.beta import ConstantBeta
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import CuriosityConfig, defaults
-from mace_rl.environments.planted import FlagNovelty
 from mace_rl.environments.rollout import Episode
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive

@@ -145,7 +145,6 @@ class CuriosityTracker:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """See `CuriosityReward`."""
         state = {
             "settings": self.described(),
             "curiosity": self.curiosity.state_dict(),
@@ -157,7 +156,6 @@ class CuriosityTracker:
         return copy.deepcopy(state)  # the training may go on before this is saved
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `CuriosityReward`."""
         theirs, mine = state["settings"], self.described()
         for name in sorted(theirs.keys() | mine.keys()):
             if name not in theirs or name not in mine or theirs[name] != mine[name]:

@@ -49,7 +49,6 @@ class CompiledLearner(Stateful):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """See `Learner`."""
         return CompiledActing.of(cast(CompiledMLP, policy.network), policy.log_std, normalisation)
 
     def update(
@@ -68,14 +67,12 @@ class CompiledLearner(Stateful):
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """See `Learner`."""
         weights = np.stack([item / len(item) for item in advantages]).astype(np.float32)
         observations = np.ascontiguousarray(observations, np.float32)
         network, parameters = self.network, self.policy.parameters
         return list(policy_gradients(observations, actions, weights, parameters, network.sizes))
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """See `Learner`."""
         return self.optimisers["actor"].preconditioned(direction)
 
 

@@ -66,7 +66,6 @@ class NetworkActing:
         return self.policy.network.outputs(seen[None])
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
         outputs = self.outputs(observation)[0]
         if self.policy.discrete:
             return sample_categorical(outputs, noise)
@@ -94,7 +93,6 @@ class CompiledActing(NamedTuple):
         return cls(normalisation, network.parameters, sizes, log_std, seen, buffer)
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
         sample = act_box if len(self.log_std) else act_discrete
         return sample(observation, self, noise)
 

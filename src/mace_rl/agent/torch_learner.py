@@ -69,9 +69,7 @@ class TorchLearner(Stateful):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """See `Learner`."""
         return NetworkActing(policy, normalisation)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """See `Learner`."""
         return self.actor.preconditioned(direction, self.optimiser)

@@ -35,7 +35,6 @@ class TorchPolicy(torch.nn.Module):
     def gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """See `Learner.policy_gradients`."""
         log_probs = self(from_numpy(observations)).log_prob(from_numpy(actions))
         found = []
         for item in advantages:

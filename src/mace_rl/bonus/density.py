@@ -53,7 +53,6 @@ class CompiledAutoencoder(CompiledMLP):
             weights[:] = mask.numpy().T
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `CompiledMLP`."""
         return super().backward(trace, grad_outputs) * self.mask
 
 

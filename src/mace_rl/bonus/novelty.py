@@ -98,7 +98,6 @@ class CountNovelty(Stateful, Novelty):
         return self.continued(states, np.zeros_like(self.counts))
 
     def continued(self, states: np.ndarray, visits: np.ndarray) -> np.ndarray:
-        """See `Novelty`."""
         counts = self.counts + visits
         novelty = np.empty(len(states))
         for t, state in enumerate(states.argmax(axis=1)):
@@ -244,7 +243,6 @@ class DensityNovelty(Stateful, Novelty):
         return bool((new >= 0).any())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
         super().load_state_dict(state)
         self._build_index(self.mean, self.std, self.varied)
 

@@ -43,22 +43,18 @@ class TorchNetwork:
 
     @torch.no_grad()
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
         return self._module(torch.from_numpy(np.array(inputs, np.float32))).numpy()
 
     def move_to(self, memory: np.ndarray) -> None:
-        """See `Network`."""
         vector = torch.from_numpy(memory)
         vector.copy_(torch.nn.utils.parameters_to_vector(self._module.parameters()).detach())
         torch.nn.utils.vector_to_parameters(vector, self._module.parameters())  # as views
         self.parameters = memory
 
     def module(self) -> torch.nn.Module:
-        """See `Network`."""
         return self._module
 
     def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
-        """See `Network`."""
         self._module.load_state_dict(state)
 
 
@@ -83,7 +79,6 @@ class CompiledMLP:
         self.load_module_state(module.state_dict())
 
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
         return self.forward(inputs).outputs
 
     def forward(self, inputs: np.ndarray) -> Trace:
@@ -125,7 +120,6 @@ class CompiledMLP:
         return views
 
     def module(self) -> torch.nn.Sequential:
-        """See `Network`."""
         module = tanh_layers(self.sizes.tolist())
         linear = [layer for layer in module if isinstance(layer, torch.nn.Linear)]
         with torch.no_grad():
@@ -135,7 +129,6 @@ class CompiledMLP:
         return module
 
     def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
-        """See `Network`."""
         for place, (weights, biases) in enumerate(self.layers(self.parameters)):
             weights[:] = state[f"{2 * place}.weight"].numpy().T
             biases[:] = state[f"{2 * place}.bias"].numpy()

@@ -34,7 +34,6 @@ class RunningNormaliser(Stateful):
         return standardised(observations, self.mean, self.std, bound)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
         super().load_state_dict(state)
         spread(self.count, self.sum_of_squares, self.std, self.varied)
 
