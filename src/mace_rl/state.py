@@ -1,4 +1,4 @@
-"""What a checkpoint holds of an object: the attributes that it names."""
+"""Objects whose state is in checkpoints: the attributes that they name."""
 
 import copy
 from collections import deque
@@ -11,8 +11,8 @@ import torch
 class Stateful:
     """`STATE` names the attributes that the rest of a run depends on.
 
-    Arrays, numbers, None, NumPy's generators, what has a `state_dict` of its own; and lists, deques
-    and dictionaries of these.
+    They are arrays, numbers, None, NumPy's generators, objects with a `state_dict`, and lists,
+    deques and dictionaries of these.
     """
 
     STATE: tuple[str, ...] = ()
@@ -44,7 +44,7 @@ def saved(value: Any) -> Any:
 
 
 def restored(current: Any, state: Any) -> Any:
-    """What `saved` made `state` of, to take the place of `current`, which may be it, changed."""
+    """The value that `saved` made `state` of, to replace `current`; where possible it, changed."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current

@@ -30,9 +30,8 @@ def generalised_advantages(
 def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
     """Advantages with root mean square 1, float64 [N]; if `centred`, with mean 0 too.
 
-    A rollout is often one episode. To centre it is to forget whether it went better or worse than
-    expected as a whole, and to blow up what is left, which in an episode that went well all the way
-    is noise.
+    Centring a rollout of one episode forgets whether the episode as a whole went better or worse
+    than expected, and amplifies the rest, which may be noise.
     """
     if centred:
         advantages = advantages - mean(advantages)
@@ -41,10 +40,7 @@ def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
 
 @kernel
 def normalised_change(advantages: np.ndarray, change: np.ndarray, centred: bool) -> np.ndarray:
-    """d normalised(advantages + ε · change) / dε at ε = 0, [N].
-
-    What of the change is parallel to the advantages is lost in the normalisation.
-    """
+    """d normalised(advantages + ε · change) / dε at ε = 0, [N]."""
     if centred:
         advantages, change = advantages - mean(advantages), change - mean(change)
     spread = root_mean_square(advantages) + 1e-8

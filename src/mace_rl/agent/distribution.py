@@ -1,7 +1,7 @@
 """Distributions over actions: softmax for Discrete ones, else a diagonal Gaussian; compiled.
 
-Its log standard deviations, `log_std`, float32 [actions], do not depend on the state; for Discrete
-actions there are none.
+The Gaussian's log standard deviations, `log_std`, float32 [actions], do not depend on the state.
+For Discrete actions `log_std` is empty.
 """
 
 import numpy as np

@@ -1,4 +1,7 @@
-"""What PPO's update needs of a learner, of which there are two: compiled, and in plain PyTorch."""
+"""The interface of PPO's update, and what goes in and out; it is written twice.
+
+`torch_learner` has it in plain PyTorch, to read, and `compiled_learner` in compiled code.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,12 +33,12 @@ class Minibatches(NamedTuple):
 
 @dataclass
 class Update:
-    """What an update tells of itself."""
+    """Diagnostics of an update."""
 
     gradient_norms: dict[str, float]  # of the last minibatch, before clipping, by network
-    # Means over the steps of the last epoch, each as its minibatch was learnt from.
+    # Means over the steps of the last epoch, before each minibatch's update.
     approximate_kl: float  # of the policy to the one that acted (Schulman 2020)
-    clip_fraction: float  # of the ratios outside the clipping bounds
+    clip_fraction: float  # share of the ratios outside the clipping bounds
     entropy: float  # of the policy, nats
 
 
@@ -48,7 +51,7 @@ class Learner(Protocol):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """A policy of such networks for rollouts."""
+        """The policy for rollouts."""
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
@@ -64,13 +67,10 @@ class Learner(Protocol):
         """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """`direction` in the policy's parameters, [n], in the units in which its Adam steps.
-
-        That is over √v̂ + ε, v̂ the second moment; the direction itself before the first step.
-        """
+        """`Adam.preconditioned` of the policy's optimiser."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The optimiser's state; not the parameters."""
+        """Parameters and the optimiser's state."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
@@ -78,5 +78,4 @@ class Learner(Protocol):
 
 def parameters_of(policy: Policy, critics: Mapping[str, Network]) -> dict[str, np.ndarray]:
     """Those of "actor" and of each critic, float32 [n]: the same memory."""
-    own = {kind: critic.parameters for kind, critic in critics.items()}
-    return {"actor": policy.parameters, **own}
+    return {"actor": policy.parameters} | {kind: own.parameters for kind, own in critics.items()}

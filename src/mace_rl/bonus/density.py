@@ -1,7 +1,6 @@
 """Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs.
 
-`MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same in
-compiled code; `DensityEstimator` makes a density of its outputs.
+`MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same compiled.
 """
 
 import numpy as np
@@ -18,8 +17,7 @@ SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have i
 class MaskedAutoencoder(torch.nn.Module):
     """μ_i and log σ_i, each a function of the inputs before the i-th: [N, size] → [N, 2 size].
 
-    One hidden layer with tanh. Masked weights start at 0 and their gradient is 0, so they stay
-    there.
+    One hidden layer with tanh. Masked weights start at 0, and their gradient is 0.
     """
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
@@ -57,10 +55,7 @@ class CompiledAutoencoder(CompiledMLP):
 
 
 class DensityEstimator:
-    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)).
-
-    Being autoregressive it is normalised: p integrates to 1 whatever the weights are.
-    """
+    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)): p integrates to 1 whatever the weights."""
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
         self.network = CompiledAutoencoder(MaskedAutoencoder(size, hidden_units, generator))

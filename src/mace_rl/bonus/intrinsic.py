@@ -19,14 +19,14 @@ class Bonus(NamedTuple):
 
 
 class IntrinsicReward(ABC):
-    """R_I of every step, and what it rests on.
+    """R_I of every step.
 
-    An episode is rewarded for what was known before it; `remember` adds it to what is known. One of
-    the user's own is made as Class(spaces, generator, **arguments) with the environment's
+    An episode is rewarded for what was known before it; `remember` adds it to what is known. A
+    user's own is made as Class(spaces, generator, **arguments) with the environment's
     `mace_rl.environments.spaces.Spaces`; it raises `ConfigError` for arguments that it cannot use.
     """
 
-    largest = math.inf  # a step's reward is in [0, largest]; a run in which it is not is stopped
+    largest = math.inf  # bound of a step's reward: a run is stopped if one is not in [0, largest]
 
     @abstractmethod
     def bonus(self, episode: Episode) -> Bonus:

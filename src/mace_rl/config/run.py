@@ -1,9 +1,7 @@
 """Everything that determines one training run, typed, frozen and checked once.
 
-The values and their sources (paper, the authors' public code, our choice) stand in `config.yaml`;
-this module, with `agent`, `bonus` and `beta` beside it, says what each one means and which values
-are possible. A `RunConfig` is all a run depends on besides the code: equal `RunConfig`s give equal
-results.
+`config.yaml` has the values and their sources. This module, with `agent`, `bonus` and `beta` beside
+it, says what each means and may be. Equal `RunConfig`s and equal code give equal results.
 """
 
 from collections.abc import Mapping
@@ -18,14 +16,14 @@ from mace_rl.config.section import Arguments, Section
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
-BONUS_SECTIONS = ("bonus", "memory", "novelty")  # what only variants with a bonus use
+BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 
 
 class RunConfig(Section):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
-    others, so that a change of what a variant does not use leaves its runs alone.
+    `bonus`, `memory`, `novelty` and `meta` are None in variants that do not use them, so that
+    changing them does not concern these runs.
     """
 
     environment: str
@@ -59,11 +57,11 @@ class RunConfig(Section):
         return self
 
     def settings(self) -> dict[str, Any]:
-        """Plain values, as in `run.json`, without what is not used: equal ones, equal results."""
+        """Plain values, as in `run.json`, without unused sections."""
         return {name: value for name, value in self.model_dump().items() if value is not None}
 
     def references(self) -> dict[str, str]:
-        """By key, the code from outside this package that takes part, as package.module:Name."""
+        """By key, the code that the run names as package.module:Name."""
         found = {
             "environment": self.environment if ":" in self.environment else None,
             "ppo.network.module": getattr(self.ppo.network, "module", None),

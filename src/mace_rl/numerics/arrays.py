@@ -1,4 +1,4 @@
-"""Sums, moments, quantiles and permutations of arrays: loops in a written order."""
+"""Sums, moments, quantiles and permutations of arrays: loops in a fixed order."""
 
 import math
 
@@ -52,7 +52,7 @@ def quantile(values: np.ndarray, share: float) -> float:
 def shuffled(draws: np.ndarray) -> np.ndarray:
     """Permutations of N, int64 [K, N], by Fisher and Yates, from draws in [0, 1), [K, N].
 
-    The k-th is uniform if the draws are; a draw of almost 1 leaves a place as it is.
+    The permutations are uniform if the draws are; draws of 1 leave the order as it is.
     """
     order = np.empty(draws.shape, np.int64)
     for k in range(len(draws)):
