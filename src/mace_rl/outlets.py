@@ -1,7 +1,4 @@
-"""Standard output and error whose failures end no training.
-
-If a terminal hangs up, a pipe's reader ends or a disk fills up, output is dropped.
-"""
+"""Standard output and error that end no training if a terminal, a pipe or a disk fails."""
 
 import io
 import os

@@ -92,10 +92,7 @@ class RecordError(Refusal, ValueError):
 
 
 def write_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of `EpisodeRecord` (`as_columns`), atomically.
-
-    Raises `RecordError` for what `read_episodes` would refuse.
-    """
+    """Write `as_columns` of `EpisodeRecord`s, atomically; `RecordError` if they are impossible."""
     _check_episodes(path, columns)
     _write(path, columns)
 

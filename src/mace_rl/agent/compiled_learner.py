@@ -112,10 +112,7 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
 
 @kernel
 def improve_values(observations, returns, minibatches, sizes, adam):
-    """Descend the mean squared error of V(s) against the λ-returns, float32 [N].
-
-    The other arguments as in `improve_policy`. Returns the last minibatch's gradient norm.
-    """
+    """`improve_policy` for V(s), by the mean squared error against the λ-returns, float32 [N]."""
     parameters = adam.parameters
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradient, norm = np.empty_like(parameters), 0.0
@@ -139,10 +136,7 @@ def improve_values(observations, returns, minibatches, sizes, adam):
 
 @kernel
 def policy_gradients(observations, actions, weights, parameters, sizes):
-    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n].
-
-    parameters: a `Policy`'s; the other arguments as in `improve_policy`.
-    """
+    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n]."""
     log_std, back = own_part(parameters, sizes), transposed(parameters, sizes)
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradients = np.zeros((len(weights), len(parameters)), np.float32)

@@ -81,10 +81,7 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
 
 @kernel
 def sample_categorical(logits, uniform):
-    """Sample a categorical action by inverting its distribution function at `uniform` in [0, 1).
-
-    Returns (action from 0, log-probability, float32).
-    """
+    """An action, and its log-probability, by the inverse distribution function at `uniform`."""
     log_total = log_sum_exp(logits)
     cumulative = 0.0
     action = len(logits) - 1  # stays if rounding leaves the sum below `uniform`
@@ -98,10 +95,7 @@ def sample_categorical(logits, uniform):
 
 @kernel
 def sample_gaussian(means, log_std, normal):
-    """Sample a diagonal Gaussian action, means + exp(log_std) · normal; `normal`: [actions].
-
-    Returns (action float32 [actions], not clipped to the bounds; log-probability, float32).
-    """
+    """An action, means + exp(log_std) · normal, float32 [actions], and its log-probability."""
     action = np.empty(len(log_std), np.float32)
     for i in range(len(log_std)):
         action[i] = means[i] + exp(log_std[i]) * f32(normal[i])

@@ -1,7 +1,4 @@
-"""The interface of PPO's update, and what goes in and out; it is written twice.
-
-`torch_learner` has it in plain PyTorch, to read, and `compiled_learner` in compiled code.
-"""
+"""The interface of PPO's update, which is in `torch_learner`, to read, and `compiled_learner`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,10 +53,7 @@ class Learner(Protocol):
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
     ) -> Update:
-        """Descend PPO's losses in every minibatch.
-
-        returns: for each critic the λ-returns that it learns, float32 [N].
-        """
+        """Descend PPO's losses in all minibatches; returns: each critic's λ-returns, float32 [N]."""
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]

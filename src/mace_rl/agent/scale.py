@@ -34,10 +34,7 @@ class RewardScale(Stateful):
 
 
 class AdvantageScale(Stateful):
-    """The divisor of advantages: their root mean square so far, at least `smallest`.
-
-    It falls slowly when advantages do, so advantages that fade stay small after the division.
-    """
+    """The divisor of advantages: their root mean square so far, at least `smallest`."""
 
     STATE = ("count", "squares")
 

@@ -1,7 +1,4 @@
-"""Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs.
-
-`MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same compiled.
-"""
+"""Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs."""
 
 import numpy as np
 import torch

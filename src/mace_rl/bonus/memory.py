@@ -104,10 +104,7 @@ class EpisodicMemory(Stateful):
 def recollect(
     squared_distances: np.ndarray, indices: np.ndarray, returns: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `EpisodicMemory.recall` computes from the nearest entries.
-
-    squared_distances: float32 [N, k], ascending; indices: int64 [N, k]; returns: float32 [M].
-    """
+    """`EpisodicMemory.recall` from what `search` returns, and all entries' returns, float32 [M]."""
     recalled, similarity = np.empty((2, len(squared_distances)), np.float32)
     for n in range(len(squared_distances)):
         total = weighted = 0.0

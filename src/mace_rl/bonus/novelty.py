@@ -232,7 +232,7 @@ class DensityNovelty(Stateful, Novelty):
 
 
 @kernel
-def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def mean_distances(squared_distances, neighbours):
     """Mean distance to the k nearest, for each k of `neighbours`, float64 [T, ensemble].
 
     squared_distances: float32 [T, at least the largest k], nearest first; neighbours: ascending.
@@ -249,12 +249,10 @@ def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.
 
 
 @kernel
-def shares_beyond(
-    squared_distances: np.ndarray, neighbours: np.ndarray, usual: np.ndarray
-) -> np.ndarray:
+def shares_beyond(squared_distances, neighbours, usual):
     """The mean over the ensemble of 1 - d*/d where d is beyond the `usual` d*, else 0: [T].
 
-    d: of `mean_distances`. Where states repeat exactly both are 0, and so is the result.
+    d: of `mean_distances`. Where states repeat exactly, d, d* and the result are 0.
     """
     distances = mean_distances(squared_distances, neighbours)
     result = np.zeros(len(squared_distances))
@@ -267,7 +265,7 @@ def shares_beyond(
 
 
 @kernel
-def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.ndarray:
+def improbability(log_probs, usual, dimensions):
     """1 - exp(-(l* - l) / D) where l is below the `usual` l*, else 0: float64 [T]."""
     result = np.zeros(len(log_probs))
     for t in range(len(log_probs)):
@@ -278,14 +276,7 @@ def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.nd
 
 
 @kernel
-def replacements(
-    states: np.ndarray,
-    apart: np.ndarray,
-    redundancy: np.ndarray,
-    neighbours: np.ndarray,
-    sample: np.ndarray,
-    std: np.ndarray,
-) -> np.ndarray:
+def replacements(states, apart, redundancy, neighbours, sample, std):
     """Which of the new states takes the place of each of the sampled entries, -1 for none, [S].
 
     apart, redundancy: squared distance of each new state, [N], and of each sampled entry, [S], to

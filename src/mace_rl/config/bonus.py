@@ -70,10 +70,7 @@ class CuriosityBonus(Section):
 
 
 class CustomBonus(Section):
-    """A bonus from the class `estimator`, a `mace_rl.bonus.intrinsic.IntrinsicReward`.
-
-    It is made as estimator(spaces, generator, **arguments).
-    """
+    """A `mace_rl.bonus.intrinsic.IntrinsicReward`: estimator(spaces, generator, **arguments)."""
 
     kind: Literal["custom"]
     estimator: Reference

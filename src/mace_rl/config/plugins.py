@@ -92,10 +92,7 @@ def import_module(reference: str, key: str) -> ModuleType:
 
 
 def source_files(reference: str, key: str) -> list[Path]:
-    """The Python file of the module in "package.module:Name", found without importing it.
-
-    If it is in a package, the other files in its folder too.
-    """
+    """The Python file of a module, without importing it; in a package all files in its folder."""
     _look_here_too()
     module = reference.partition(":")[0]
     try:

@@ -43,10 +43,7 @@ def read_options(options: Iterable[str]) -> Settings:
 def merge(
     base: Mapping[str, Any], over: Mapping[str, Any], whole: Collection[str] = ()
 ) -> Settings:
-    """`base` with the values of `over`, as Snakemake merges `--configfile`.
-
-    Mappings merge; all other values, and the keys `whole`, are replaced.
-    """
+    """`base` with `over` read over it. Mappings merge, but for the keys `whole`."""
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)

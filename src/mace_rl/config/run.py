@@ -73,10 +73,7 @@ class RunConfig(Section):
 
 
 def unused_sections(settings: Any) -> dict[str, str]:
-    """The sections that a run with these settings does not use, each with what in them says so.
-
-    settings: a `RunConfig`, or plain values before they are checked.
-    """
+    """The sections that a run with these settings, plain or checked, does not use, with reasons."""
 
     def value(*keys: str) -> Any:
         found = settings

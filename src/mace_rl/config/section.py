@@ -74,10 +74,7 @@ Arguments = Annotated[
 
 
 def check(model: type[Model], values: Any, origin: str) -> Model:
-    """Build `model` from `values`, or raise a one-line `ConfigError` for the first mistake.
-
-    `origin`, such as a file name, starts the message.
-    """
+    """`model` from `values`; a one-line `ConfigError`, begun by `origin`, for the first mistake."""
     try:
         return model.model_validate(values)
     except ValidationError as error:

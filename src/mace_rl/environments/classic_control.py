@@ -1,4 +1,7 @@
-"""CartPole-v1 and Acrobot-v1 in compiled code: whole episodes, equal to Gymnasium's to the bit."""
+"""CartPole-v1 and Acrobot-v1 in compiled code: whole episodes, equal to Gymnasium's to the bit.
+
+All arithmetic is in Gymnasium's order.
+"""
 
 import math
 
@@ -12,10 +15,7 @@ CARTPOLE, ACROBOT = 0, 1
 
 @njit(cache=True)
 def step_cartpole(state, action):
-    """One step of Gymnasium's CartPole-v1 in its own order of operations.
-
-    state: float64 [4], advanced in place. Returns (reward, terminated).
-    """
+    """One step of CartPole-v1; changes `state`, float64 [4]; returns (reward, terminated)."""
     x, x_dot, theta, theta_dot = state[0], state[1], state[2], state[3]
     total_mass = 0.1 + 1.0
     polemass_length = 0.1 * 0.5
@@ -77,10 +77,7 @@ def _wrap(angle):
 
 @njit(cache=True)
 def step_acrobot(state, action, two):
-    """One step of Gymnasium's Acrobot-v1 in its own order of operations.
-
-    state: float64 [4], advanced in place. Returns (reward, terminated).
-    """
+    """One step of Acrobot-v1; changes `state`, float64 [4]; returns (reward, terminated)."""
     torque = action - 1.0
     start = (state[0], state[1], state[2], state[3])
     k1 = _acrobot_derivatives(start, torque, two)

@@ -42,10 +42,8 @@ def mean_of_11(v: NDArray[np.float64]) -> float:
 
 @cache
 def numpy_adds_as_assumed() -> bool:
-    """Whether this numpy adds 3 or 11 numbers, and takes a norm, in the order written here.
-
-    It tries numbers of such different sizes that another order gives other bits.
-    """
+    """Whether this numpy adds 3 or 11 numbers, and takes a norm, in the order written here."""
+    # Sizes so different that another order gives other bits.
     rng = np.random.default_rng(0)
     tried = rng.standard_normal((50, 33)) * 10.0 ** rng.integers(-3, 4, (50, 33))
     return all(
@@ -56,14 +54,8 @@ def numpy_adds_as_assumed() -> bool:
     )
 
 
-# Direction and distance of the target, sin and cos of the angle to it, speed turned by -yaw.
-TowardsTarget = tuple[float, float, float, float, float, float, float]
-
-
 @njit(cache=True)
-def in_plane(
-    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
-) -> tuple[bool, TowardsTarget]:
+def in_plane(dx, dy, yaw, vx, vy, vz):
     """Whether the hopper moves in the plane y = 0, facing the target; `towards_target` if so.
 
     Then every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
@@ -75,10 +67,8 @@ def in_plane(
     return holds, (dy, dx, dy - yaw, 1.0, vx + 0.0, 0.0, vz + 0.0)
 
 
-def towards_target(
-    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
-) -> TowardsTarget:
-    """In any position, by the library's arithmetic."""
+def towards_target(dx, dy, yaw, vx, vy, vz):
+    """Angle and distance of the target, sin and cos of the turn to it, speed turned by -yaw."""
     theta = np.arctan2(dy, dx)
     target = np.array((dy, dx))
     sin, cos = np.sin(-yaw), np.cos(-yaw)
@@ -89,15 +79,7 @@ def towards_target(
 
 
 @njit(cache=True)
-def state_in_plane(
-    raw: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    floor_xyz: NDArray[np.float64],
-    target_x: float,
-    target_y: float,
-    initial_z: float,
-    feet_contact: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], int, float, float, bool]:
+def state_in_plane(raw, ranges, floor_xyz, target_x, target_y, initial_z, feet_contact):
     """`robot.calc_state` if `in_plane` holds; otherwise state[1:6] is wrong.
 
     raw: float64 [42], the ten parts' positions [10, 3], the joints' angles and speeds [3, 2], the
@@ -200,10 +182,7 @@ class FastHopperBulletEnv(HopperBulletEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """The library's reset, from the second one on without what then changes nothing.
-
-        That is: switches of a display that is not there, a second reading of the robot's parts.
-        """
+        """The library's reset, from the second one on without what then changes nothing."""
         if not self.fast:
             result = super().reset(seed=seed, options=options)
             if not self._decided:

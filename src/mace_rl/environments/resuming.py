@@ -72,10 +72,7 @@ class LastEpisodes:
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
-    """In what a new environment differs when it plays the episodes in `LastEpisodes.blocks` again.
-
-    "" if in nothing. The environment then also remembers what it keeps from these episodes.
-    """
+    """How a new environment plays `LastEpisodes.blocks` again otherwise; "" if equally."""
     for one in itertools.chain.from_iterable(blocks):
         set_state(environment, one["start"])
         try:

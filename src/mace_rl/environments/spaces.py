@@ -69,10 +69,7 @@ class Spaces:
         )
 
     def number(self, what: str, value: Any, step: int) -> float:
-        """A reward or flag of a step, counted from 1; `ConfigError` unless it is one number.
-
-        An array of one number counts as that number.
-        """
+        """A reward or flag of a step, counted from 1; `ConfigError` unless it is one number."""
         if type(value) is float or type(value) is bool:
             return value
         if (found := _only(_array(value))) is None:

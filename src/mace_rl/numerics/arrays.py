@@ -50,9 +50,9 @@ def quantile(values: np.ndarray, share: float) -> float:
 
 @kernel
 def shuffled(draws: np.ndarray) -> np.ndarray:
-    """Permutations of N, int64 [K, N], by Fisher and Yates, from draws in [0, 1), [K, N].
+    """K permutations of N, int64 [K, N], by Fisher and Yates, from uniform draws in [0, 1), [K, N].
 
-    The permutations are uniform if the draws are; draws of 1 leave the order as it is.
+    Draws of 1 leave the order as it is.
     """
     order = np.empty(draws.shape, np.int64)
     for k in range(len(draws)):

@@ -92,10 +92,8 @@ def exp(x):
 
 @kernel
 def log(x):
-    """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf.
-
-    x = 2ⁿ m, and a polynomial for m between √½ and √2 (coefficients: Cephes, logf).
-    """
+    """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf."""
+    # x = 2ⁿ m, and a polynomial for m between √½ and √2 (coefficients: Cephes, logf).
     bits = bits_of(x) - np.int32(0x3F3504F3)  # of √½
     n = f32(bits >> np.int32(23))
     f = float_of((bits & np.int32(0x007FFFFF)) + np.int32(0x3F3504F3)) - f32(1)

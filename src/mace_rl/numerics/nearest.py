@@ -226,14 +226,11 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
 
 @kernel
 def distance_bound(least, count):
-    """A bound within which are at least `count` of 64 distances; Inf if `count` is larger.
-
-    By bisection of a float32's bits, down to 2¹⁷ of them: up to 1.6 % too large.
-    """
+    """A bound for at least `count` of 64 distances, up to 1.6 % too large; Inf if `count` > 64."""
     low, high = np.int32(0), INFINITE
     if count > BLOCK:
         return float_of(high)
-    while high - low > 2**17:
+    while high - low > 2**17:  # of a float32's bits
         middle = np.int32((low + high) // 2)
         if how_many(within(address(least), float_of(middle))) < count:
             low = middle
@@ -244,10 +241,7 @@ def distance_bound(least, count):
 
 @kernel
 def sort(numbers, found, ranked):
-    """Sort the first `found` of different numbers into `ranked`, which is as long.
-
-    The rank of each is how many are smaller: no branches, and many comparisons at a time.
-    """
+    """Sort the first `found` of different numbers into `ranked`, by how many are smaller."""
     for k in range(found, found + RANKED):
         numbers[k] = LARGEST
     for k in range(found):

@@ -54,10 +54,7 @@ class Matrix(NamedTuple):
 
 
 def tile(rows: int, vectors: int) -> Any:
-    """The compiled tile of `rows` × 16 `vectors`: C = start + Σ_k A[i, k] B[k, j].
-
-    Its arguments are four `Matrix`, its first row and column in C, and K.
-    """
+    """The compiled tile of `rows` × 16 `vectors`: C = start + Σ_k A[i, k] B[k, j], k < count."""
 
     @intrinsic
     def multiply(context, a, b, start, c, first_row, first_column, count):

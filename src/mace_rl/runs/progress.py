@@ -152,10 +152,8 @@ def held(lock: Path) -> bool:
 
 
 def seconds_left(runs: Sequence[Run], cores: int) -> tuple[float, list[str]]:
-    """Seconds to the end of the last run, and the environments left out since none is known.
-
-    A run is expected to take as long, relative to its work, as the known ones of its environment.
-    """
+    """Seconds to the end of the last run, and the environments left out since none is known."""
+    # A run is expected to take as long, for its work, as the known ones of its environment.
     paces: dict[str, list[float]] = {}
     for run in runs:
         if not math.isnan(run.seconds):
