@@ -164,13 +164,11 @@ class CuriosityTracker(Stateful):
 
 def require_usable(rule: str, controller: BetaController, environments: int) -> None:
     """Raise `ConfigError` for a user's own rule that needs what a wrapper lacks."""
+    why = ""
     if controller.learns:
-        raise ConfigError(
-            f"beta.rule has {rule!r}, which learns from policy gradients, but only our trainer has "
-            "these"
-        )
-    if controller.one_at_a_time and environments > 1:
-        raise ConfigError(
-            f"beta.rule has {rule!r}, which learns from each episode before the next begins, but "
-            f"here {environments} go on at once: wrap each environment in a CuriosityReward"
-        )
+        why = "from policy gradients, but only our trainer has these"
+    elif controller.one_at_a_time and environments > 1:
+        why = f"from each episode before the next begins, but here {environments} go on at once: "
+        why += "wrap each environment in a CuriosityReward"
+    if why:
+        raise ConfigError(f"beta.rule has {rule!r}, which learns {why}")

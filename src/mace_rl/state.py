@@ -1,6 +1,7 @@
 """Objects whose state is in checkpoints: the attributes that they name."""
 
 import copy
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import Any
 
@@ -8,7 +9,19 @@ import numpy as np
 import torch
 
 
-class Stateful:
+class HasState(ABC):
+    """An interface of parts whose state is in checkpoints."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class Stateful(HasState):
     """`STATE` names the attributes that the rest of a run depends on.
 
     They are arrays, numbers, None, NumPy's generators, objects with a `state_dict`, and lists,
@@ -18,7 +31,6 @@ class Stateful:
     STATE: tuple[str, ...] = ()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
         return {name: saved(getattr(self, name)) for name in self.STATE}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

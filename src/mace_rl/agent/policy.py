@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.distribution import sample_categorical, sample_gaussian
+from mace_rl.agent.distribution import log_probs, sample_categorical, sample_gaussian
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.network import CompiledMLP, Network
 from mace_rl.numerics.network_kernels import activation_buffer, forward

@@ -1,7 +1,7 @@
 """Novelty of states, in [0, 1]: visitation counts, or k-NN distances and a density estimator."""
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ from mace_rl.numerics.elementary import exp, fma
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.normaliser import RunningNormaliser, standardised
-from mace_rl.state import Stateful
+from mace_rl.state import HasState, Stateful
 from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
 
 
-class Novelty(ABC):
+class Novelty(HasState):
     """How new the states of an episode are; `observe` then makes them known.
 
     A user's own is made as Class(size, generator, **arguments), with the size of an observation (a
@@ -45,14 +45,6 @@ class Novelty(ABC):
     @abstractmethod
     def observe(self, states: np.ndarray) -> None:
         """Take in an episode's states, [T, observation]."""
-
-    @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
 
 
 def novelty(
@@ -116,8 +108,7 @@ class DensityNovelty(Stateful, Novelty):
     - Density: 1 - exp(-(l* - l) / D), with l the log-density, l* the threshold, and D the number of
       dimensions that vary.
 
-    `refresh` updates all of this, at the first end of an episode after `refresh_every` steps; in
-    between nothing changes.
+    `refresh` updates all of this at an episode's end, after at least `refresh_every` steps.
     """
 
     STATE = (

@@ -45,16 +45,12 @@ class NoveltyConfig(Section):
     density_steps: Count  # gradient steps of the density estimator in a refresh
 
     @model_validator(mode="after")
-    def _neighbours_fit(self) -> "NoveltyConfig":
+    def _keys_agree(self) -> "NoveltyConfig":
         if max(self.neighbours) >= self.buffer_size:
             raise ValueError(
                 f"neighbours has {max(self.neighbours)}, which must be less than buffer_size,"
                 f" {self.buffer_size}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _estimator_if_custom(self) -> "NoveltyConfig":
         if (self.kind == "custom") != (self.estimator is not None):
             raise ValueError("estimator and kind: custom go together")
         if self.arguments and self.kind != "custom":

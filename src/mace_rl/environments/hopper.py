@@ -130,11 +130,9 @@ class FastHopperBulletEnv(HopperBulletEnv):
     decided after the first reset, which is the library's own. An action that is not a float32 or
     float64 array of shape (3,) takes the library's step.
 
-    Randomness is `robot.np_random`, three uniform draws a reset. `reset(seed=s)` replaces it and
-    `env.np_random` by one new generator. To restore a generator, set its `bit_generator.state`:
-    assigning `env.np_random` does not reach the robot. As in the library, the first reward of an
-    instance is off, since its first reset averages positions without the floor. After one reset, a
-    new instance replays an older one to the bit.
+    Randomness is `robot.np_random`, three uniform draws a reset. To restore a generator, set its
+    `bit_generator.state`: assigning `env.np_random` does not reach the robot. As in the library,
+    the first reward of an instance is off: its first reset averages positions without the floor.
     """
 
     scene: Any  # the library's, from its first reset on

@@ -1,15 +1,13 @@
 """Exploration tasks: environments in which random actions hardly ever see a reward.
 
-    id                              return of solving it; what makes it hard
-    SparseMountainCar-v0            1; the reward comes at the goal only
-    DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
-    FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
-    CliffWalking200-v0              -13; what random actions find is the cliff, at -100 a fall
-    BarrenRegion-v0                 1; novelty without end lies elsewhere
-    NoisyMountainCar-v0             1; the same, as a television that an action switches on
-    NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
-
-Whatever an environment remembers beside its generator is of the current episode.
+id                              return of solving it; what makes it hard
+SparseMountainCar-v0            1; the reward comes at the goal only
+DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
+FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
+CliffWalking200-v0              -13; random actions find the cliff, at -100 a fall
+BarrenRegion-v0                 1; endless novelty elsewhere
+NoisyMountainCar-v0             1; the same, as a television that an action switches on
+NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
 """
 
 from typing import Any, ClassVar

@@ -125,8 +125,8 @@ class Run:
 
     def row(self) -> dict[str, str]:
         """Its row in the table."""
-        blank = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
-        shown = cells(self.told) if self.told else blank | {"episode": "starting"}
+        shown = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
+        shown |= cells(self.told) if self.told else {"episode": "starting"}
         shown |= {"left": "stopped"} if self.state == "stopped" else {}
         return {"environment": self.env, "variant": self.variant, "seed": str(self.seed)} | shown
 

@@ -96,7 +96,7 @@ def run(
                 clock.start_seconds = time.monotonic() - started
             if clock.progress_due():
                 observe(how_far(trainer, clock))
-            if time.monotonic() >= clock.next_checkpoint:
+            if clock.checkpoint_due():
                 save()
         if keep_checkpoint:
             save()
@@ -201,6 +201,10 @@ class Clock:
             return False
         self.next_progress = now + self.progress_seconds
         return True
+
+    def checkpoint_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return time.monotonic() >= self.next_checkpoint
 
     @contextmanager
     def saving(self) -> Iterator[None]:

@@ -42,7 +42,7 @@ class Film:
 
 
 class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment whose episodes are filmed, `seconds` of each at most, `width` pixels wide."""
+    """Films the first `seconds` of each episode of an environment, `width` pixels wide."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, width: int, seconds: float) -> None:
         super().__init__(env)
