@@ -40,12 +40,9 @@ def parser() -> argparse.ArgumentParser:
     flag = {"action": "store_true"}
     trust = {**flag, "help": "import code that run.json names"}
     below = "of a run, or with runs below it"
-    add = command(
-        "train",
-        train,
-        "carry out one training run; the same command resumes it if interrupted",
-        "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
-    )
+    does = "carry out one training run; the same command resumes it if interrupted"
+    run = "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run"
+    add = command("train", train, does, run)
     add("--env", required=True, help="a Gymnasium id: [module:][Namespace/]Id")
     add("--variant", required=True, help="one of the config's variant_settings")
     add("--seed", default=0, type=int, help="(default: 0)")
@@ -59,30 +56,15 @@ def parser() -> argparse.ArgumentParser:
     add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
     anew = "move a run that is in the folder into a folder below it, and train from the start"
     add("--restart", **flag, help=anew)
-    command(
-        "status",
-        status,
-        "print how far the workflow's runs are, and about when they will be done",
-        "results/reduced",
-        folder="the workflow's results folder",
-    )
-    for name, run, does, example, episodes in (
-        (
-            "evaluate",
-            evaluate,
-            "play episodes with a trained agent and print its returns",
-            "cartpole_run --episodes 20 --deterministic",
-            100,
-        ),
-        (
-            "watch",
-            watch,
-            "write an animated GIF of the first episodes that evaluate plays",
-            "cartpole_run --out cartpole.gif",
-            1,
-        ),
+    does = "print how far the workflow's runs are, and about when they will be done"
+    command("status", status, does, "results/reduced", folder="the workflow's results folder")
+    play = "play episodes with a trained agent and print its returns"
+    film = "write an animated GIF of the first episodes that evaluate plays"
+    for name, function, does, example, episodes in (
+        ("evaluate", evaluate, play, "cartpole_run --episodes 20 --deterministic", 100),
+        ("watch", watch, film, "cartpole_run --out cartpole.gif", 1),
     ):
-        add = command(name, run, does, example, folder="of a finished run")
+        add = command(name, function, does, example, folder="of a finished run")
         add("--episodes", type=int, default=episodes, help=f"how many (default: {episodes})")
         add("--seed", type=int, default=0, help="of the episodes (default: 0)")
         most = "take the most probable action, or the mean, instead of a sample"
@@ -91,26 +73,18 @@ def parser() -> argparse.ArgumentParser:
     add("--untrained", **flag, help="film the agent as it was before training")
     add("--seconds", type=float, default=10.0, help="of each episode at most (default: 10)")
     add("--width", type=int, default=300, help="in pixels (default: 300)")
-    film = "a GIF file (default: watch.gif or watch_untrained.gif in the folder)"
-    add("--out", type=Path, help=film)
-    add = command(
-        "tensorboard",
-        tensorboard,
-        "write what runs recorded, finished or not, as event files for TensorBoard",
-        "cartpole_run --out events",
-        folder=below,
-    )
+    out = "a GIF file (default: watch.gif or watch_untrained.gif in the folder)"
+    add("--out", type=Path, help=out)
+    does = "write what runs recorded, finished or not, as event files for TensorBoard"
+    add = command("tensorboard", tensorboard, does, "cartpole_run --out events", below)
     add("--out", type=Path, help="folder for the event files (default: beside the records)")
-    add = command(
-        "export",
-        export,
-        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ...",
-        "cartpole_run --out runs.csv",
-        folder=below,
+    does = (
+        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ..."
     )
+    add = command("export", export, does, "cartpole_run --out runs.csv", below)
     add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")
-    repeat = "repeat kept runs and compare to the bit"
-    add = command("verify", verify, repeat, "reference --sample 1", folder=below)
+    does = "repeat kept runs and compare to the bit"
+    add = command("verify", verify, does, "reference --sample 1", below)
     add("--sample", type=int, help="how many, always the same ones (default: all)")
     add("--trust", **trust)
     return top

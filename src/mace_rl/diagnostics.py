@@ -13,10 +13,9 @@ from mace_rl.records import UpdateRecord
 
 
 def unseen(normaliser: RunningNormaliser) -> list[int]:
-    """The dimensions of observations whose differences are lost.
+    """The dimensions of observations whose differences are lost: tiny, or a few units of float32.
 
-    They are below `RunningNormaliser`'s threshold, or a few units in the last place of float32. A
-    dimension that varies only by float64's rounding is constant: suspect if the numbers are large.
+    A dimension that varies only by float64's rounding is constant: suspect if it is large.
     """
     size = abs(normaliser.mean)
     deviation = np.sqrt(normaliser.sum_of_squares / normaliser.count)

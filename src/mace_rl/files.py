@@ -59,7 +59,7 @@ def runs_below(folder: Path, names: Collection[str]) -> list[Path]:
         raise error
 
     found, seen, roots = [], set(), [folder]
-    for root in roots:  # a list that grows: links come after all else
+    for root in roots:  # the list grows: links come last
         for place, below, inside in os.walk(root, onerror=unreadable):
             below[:] = [name for name in below if not name.startswith(ASIDE)]
             if os.path.realpath(place) in seen:

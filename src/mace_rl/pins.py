@@ -1,10 +1,10 @@
 """Make libraries use only the instructions that every x86-64 processor with AVX2 has.
 
 Compiled training gives the same bits on every processor by construction (`numerics.products`).
-NumPy, OpenBLAS and PyTorch choose instructions by the processor, and their sums differ in the last
-bit. They are used for tables, figures, Hopper and torch modules of one's own. Each reads variables
-that restrict it, once. Importing this module before these libraries sets the variables, and
-Matplotlib's backend: the commands and the workflow do that, `import mace_rl` alone does not.
+NumPy, OpenBLAS and PyTorch, used for tables, figures, Hopper and torch modules of one's own, choose
+instructions by the processor, and their last bits differ. Importing this module before them sets
+the variables that restrict them, and Matplotlib's backend: the commands and the workflow do that,
+`import mace_rl` alone does not.
 """
 
 import os

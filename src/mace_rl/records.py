@@ -1,7 +1,6 @@
-"""`episodes.csv`: one row per training episode; all results are computed from these.
+"""`episodes.csv`: one row per training episode, of which all results are computed.
 
-A file that is not exactly as training writes it is refused, with its name and line: a damaged
-record could become a plausible number in Table 1.
+A damaged file is refused with its name and line, lest it become a plausible number in Table 1.
 """
 
 import csv
@@ -129,10 +128,10 @@ def read_episodes(path: str | Path, episodes: int, digest: str | None = None) ->
 def read_table(
     path: str | Path, columns: Mapping[str, type], digest: str | None = None
 ) -> "pd.DataFrame":
-    """A CSV file with a header of exactly `columns`, each of them int, float or str, as a frame.
+    """A CSV file with exactly the `columns`, each int, float or str, as a frame.
 
-    Raises `RecordError` for a file that is missing or cut off, that writing its rows would not give
-    again to the byte, or whose SHA-256 is not `digest`.
+    Raises `RecordError` unless its rows would be written like this to the byte, or if its SHA-256
+    is not `digest`.
     """
     import pandas as pd
 

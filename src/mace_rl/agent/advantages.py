@@ -30,8 +30,7 @@ def generalised_advantages(
 def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
     """Advantages with root mean square 1, float64 [N]; if `centred`, with mean 0 too.
 
-    Centring a rollout of one episode forgets whether the episode as a whole went better or worse
-    than expected, and amplifies the rest, which may be noise.
+    Centring a rollout of one episode forgets whether the whole went better than expected.
     """
     if centred:
         advantages = advantages - mean(advantages)

@@ -1,8 +1,7 @@
 """PPO's update in compiled code: K epochs over the minibatches in one call for each network.
 
 It computes what `TorchLearner` does, with gradients written out. A minibatch goes through the
-network in blocks that fit into the processor's nearest cache. That changes no bit: a gradient is a
-sum over steps in order, and `products` continue a sum where it was left.
+network in blocks that fit into the nearest cache: `products` continue the sum over steps.
 """
 
 from collections.abc import Mapping

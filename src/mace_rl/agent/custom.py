@@ -20,8 +20,8 @@ def custom_module(
 ) -> torch.nn.Module:
     """The user's own module; `generator` seeds torch's global one while it is made.
 
-    Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
-    are not [N, outputs] or not the same twice: such a run would not resume to the bit.
+    Raises `ConfigError` if it has buffers, or outputs that are not [N, outputs] or not the same
+    twice: the run would not resume to the bit.
     """
     with torch.random.fork_rng(devices=[]), as_torch_begins():
         torch.manual_seed(int(generator.integers(2**63)))

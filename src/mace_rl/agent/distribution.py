@@ -27,8 +27,7 @@ def log_sum_exp(logits):
 def log_probs(outputs, log_std, actions):
     """log π(a|s), float32 [N].
 
-    outputs: the network's, [N, actions]: logits or means; actions: int64 [N] or float32 [N,
-    actions].
+    outputs: logits or means, [N, actions]; actions: int64 [N] or float32 [N, actions].
     """
     result = np.empty(len(outputs), np.float32)
     if actions.ndim == 1:

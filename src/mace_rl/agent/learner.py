@@ -63,11 +63,8 @@ class Learner(Protocol):
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """`Adam.preconditioned` of the policy's optimiser."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters and the optimiser's state."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 def parameters_of(policy: Policy, critics: Mapping[str, Network]) -> dict[str, np.ndarray]:

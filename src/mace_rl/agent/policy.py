@@ -18,9 +18,8 @@ Action = int | np.ndarray  # from 0, or float32 [actions] before clipping to the
 class Policy:
     """Categorical for Discrete actions, diagonal Gaussian for Box ones.
 
-    The Gaussian's log standard deviation does not depend on the state; its samples are clipped to
-    the action bounds only for the environment. `parameters`, float32 [n], are the network's, then
-    the log standard deviations.
+    Samples are clipped to the action bounds only for the environment. `parameters`, float32 [n],
+    are the network's, then the log standard deviations, which do not depend on the state.
     """
 
     def __init__(

@@ -52,9 +52,8 @@ class ActorCritic:
 class PPO(ActorCritic, Stateful):
     """An actor and critics with the learner that trains them.
 
-    The total reward R_E + β R_I is a sum, so its advantage is A_E + β A_I with a value function
-    for each part: "extrinsic" always, "intrinsic" with a curiosity bonus. The networks share no
-    weights: the bonus does not reach the extrinsic critic, and reaches the actor only through β.
+    The advantage of the total reward R_E + β R_I is A_E + β A_I, with a critic for each part:
+    "extrinsic" always, "intrinsic" with a bonus. The networks share no weights.
     """
 
     STATE = ("learner", "normaliser", "generator", "reward_scales", "advantage_scales")
@@ -77,9 +76,8 @@ class PPO(ActorCritic, Stateful):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
-        observations: normalised, [T + 1, observation]; rewards: [T], before scaling. The value of
-        the last state is 0 if it is terminal, the critic's if the time limit cut the episode off.
-        With `scale_rewards` the results are in units of `reward_scale`, this episode included.
+        observations: normalised, [T + 1, observation]; rewards: [T], before scaling. After a time
+        limit the critic says what the last state is worth. The unit is `reward_scale`.
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)

@@ -13,10 +13,8 @@ from mace_rl.state import Stateful
 class EpisodicMemory(Stateful):
     """A fixed number of (key, value) entries; the least recently used one is overwritten.
 
-    Keys are states as observed. They are compared after a standardisation that the caller gives to
-    `build_index`, once after each `write`, so that old keys follow it as it changes.
-
-    A value is (next state, reward, return-to-go): what followed the state.
+    Keys are states as observed, compared after the standardisation that `build_index` was given. A
+    value is (next state, reward, return-to-go): what followed the state.
     """
 
     STATE = ("keys", "values", "usage", "number", "read", "time", "written", "stored")
@@ -25,13 +23,12 @@ class EpisodicMemory(Stateful):
         self.config = config
         self.keys = np.zeros((config.capacity, key_size), np.float32)
         self.values = np.zeros((config.capacity, key_size + 2), np.float32)
-        # For each entry the time of its last reading or writing, and its number among all that were
-        # ever written, from 1; empty ones have different numbers below 0.
-        self.usage = np.zeros(config.capacity, np.int64)
+        self.usage = np.zeros(config.capacity, np.int64)  # time of the last reading or writing
+        # Their number among all that were ever written, from 1; below 0 for empty ones.
         self.number = np.arange(-config.capacity, 0)
         self.time = self.written = self.stored = 0
-        self.newest_first = np.empty(0, np.int64)  # the entries, from the last written on
-        self.read = np.zeros(config.capacity, np.bool_)  # entries, since the last `write`
+        self.newest_first = np.empty(0, np.int64)  # entries, from the last written on
+        self.read = np.zeros(config.capacity, np.bool_)  # entries read since the last `write`
         self.neighbours: Neighbours | None = None
 
     def __len__(self) -> int:
@@ -48,8 +45,7 @@ class EpisodicMemory(Stateful):
         self.usage[self.read], self.read[:] = self.time + 1, False
         self.time += 2
         kept = min(len(keys), self.config.capacity)
-        # A long episode reads nearly every entry. Of equally used ones the first written goes, or
-        # entries that are always read would stay for ever.
+        # Of equally used ones the first written goes: a long episode reads nearly every entry.
         age = self.usage * 2**32 + self.number
         oldest = np.argpartition(age, kept - 1)[:kept]
         oldest = oldest[np.argsort(age[oldest])]

@@ -22,8 +22,7 @@ BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a 
 class RunConfig(Section):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `bonus`, `memory`, `novelty` and `meta` are None in variants that do not use them, so that
-    changing them does not concern these runs.
+    Sections that a variant does not use are None, so that changing them does not concern its runs.
     """
 
     environment: str

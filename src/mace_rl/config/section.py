@@ -60,16 +60,11 @@ def _plain(value: Any, depth: int = 0) -> Any:
     )
 
 
-def _writable(values: dict[str, Any]) -> dict[str, Any]:
-    # ValueError for half a character, and the like.
-    return dict(json.loads(json.dumps(values, ensure_ascii=False).encode()))
-
-
-# Arguments of the user's own code and of environments, which run.json has to give back unchanged.
-# (A lambda: pydantic 2.7 would set a second parameter.)
+# Arguments of the user's own code and of environments, which run.json has to give back unchanged:
+# `encode` raises ValueError for half a character. (A lambda: pydantic 2.7 would set `depth`.)
 Arguments = Annotated[
     dict[str, Annotated[Any, BeforeValidator(lambda value: _plain(value))]],
-    AfterValidator(_writable),
+    AfterValidator(lambda values: json.loads(json.dumps(values, ensure_ascii=False).encode())),
 ]
 
 

@@ -32,7 +32,7 @@ class CuriosityConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _over_the_study_s(cls, values: dict[str, Any]) -> dict[str, Any]:
+    def _over_defaults(cls, values: dict[str, Any]) -> dict[str, Any]:
         if values.get("relevance") is False and "memory" in values:
             raise ValueError("relevance False does not use memory: one of the two should go")
         for section, default in defaults().items():
@@ -43,7 +43,7 @@ class CuriosityConfig(Section):
 
     @field_validator("beta", mode="before")
     @classmethod
-    def _without_policy_gradients(cls, beta: Any) -> Any:
+    def _not_meta(cls, beta: Any) -> Any:
         if not isinstance(beta, Mapping):
             return {"kind": "constant", "value": beta}
         if beta.get("kind") == "meta":

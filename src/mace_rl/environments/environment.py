@@ -103,8 +103,7 @@ class Environment(Spaces):
                 f"environment {name!r} has {self.action_size} numbers in an action, and its "
                 f"time limit is {self.max_steps}, not up to {MOST_NOISE // self.action_size}"
             )
-        # A Bullet environment's first reset averages the robot's position over one part fewer than
-        # later ones. After it, a new environment replays an older one to the bit.
+        # A Bullet environment's first reset is unlike later ones: it averages over one part fewer.
         with trying_out(f"environment {name!r}"):
             given: Any = self.env.reset(seed=int(seed.generate_state(1)[0]))
             if not (isinstance(given, tuple) and len(given) == 2):

@@ -1,9 +1,8 @@
 """HopperBulletEnv-v0, the same to the bit, about three times as fast.
 
 The library calls the simulator some 25 times a step, through a slow wrapper; here a step is six
-calls. The rest is arithmetic on some 40 numbers, compiled: +, -, *, / in the library's order give
-numpy's bits. For sin, cos, arctan2 and dot either the result is exact on every processor, or the
-same numpy function is called.
+calls. The rest is compiled arithmetic in the library's order, with numpy's bits. For sin, cos,
+arctan2 and dot either the result is exact, or the same numpy function is called.
 """
 
 import math
@@ -58,8 +57,8 @@ def numpy_adds_as_assumed() -> bool:
 def in_plane(dx, dy, yaw, vx, vy, vz):
     """Whether the hopper moves in the plane y = 0, facing the target; `towards_target` if so.
 
-    Then every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
-    cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. This holds until the hopper has fallen.
+    Then products with dy, vy or yaw are zeros, each added to a 0.0; sin(0), cos(0), arctan2(0, dx)
+    and sqrt(dx * dx) are exact. This holds until the hopper has fallen.
     """
     yaw_positive, vy_positive = math.copysign(1.0, yaw) > 0.0, math.copysign(1.0, vy) > 0.0
     facing = yaw == 0.0 and dy == 0.0 and dx > 0.0 and (vx != 0.0 or yaw_positive)

@@ -1,7 +1,6 @@
-"""Acting: one episode with the current policy.
+"""Playing one episode with a policy, by stepping any environment.
 
-`roll_out` steps any environment. CartPole-v1 and Acrobot-v1 run in one compiled loop instead, which
-gives the same episode to the bit.
+CartPole-v1 and Acrobot-v1 run in one compiled loop, which gives the same episode to the bit.
 """
 
 from collections.abc import Callable
@@ -93,8 +92,7 @@ def rollout_for(
 def fallback_reason(environment: Environment) -> str:
     """Why this environment's fast path cannot be taken; "" if it can or there is none.
 
-    The environment and the compiled code are compared: other parameters, another version or a C
-    library with another sine need the ordinary rollout.
+    Other parameters, another version or a C library with another sine need the ordinary rollout.
     """
     inner: Any = environment.env.unwrapped
     if _is_compiled(environment):

@@ -15,10 +15,9 @@ NUMBERS = "biuf"  # NumPy's kinds of numbers
 
 
 class Spaces:
-    """Observations and actions of an environment.
+    """The spaces of an environment; `name` is for messages. `ConfigError` for unsupported ones.
 
-    Observations are flat float32 vectors; a Discrete observation becomes a one-hot vector. `name`
-    is for messages. Raises `ConfigError` for unsupported spaces.
+    Observations become flat float32 vectors, Discrete ones one-hot vectors.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
 """numba's `njit`, with a cache on disk that notices every edit of this package.
 
 numba's own notices edits only in the file of the cached function. So each version of this package
-gets its own folder. It is set only while a function of ours is decorated, so what else a program
-compiles keeps its cache.
+gets its own folder, which is set only while a function of ours is decorated.
 """
 
 import logging
@@ -22,8 +21,8 @@ from mace_rl.sources import PACKAGE, digest
 config: Any = numba.config  # which it fills as it is imported
 if config.DISABLE_JIT:
     raise Refusal("NUMBA_DISABLE_JIT is set, but this code runs compiled only: unset it")
-# Where this cannot be written, numba takes the user's folder for caches.
-# Not config.CACHE_DIR, which a .numba_config.yaml in the current folder sets: what is there is run.
+# If this cannot be written, numba takes the user's folder for caches. config.CACHE_DIR is not read:
+# a .numba_config.yaml in the current folder sets it, and what is there is run.
 FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__" / "numba")
 FOLDER /= digest("everything")[:16]
 

@@ -1,9 +1,8 @@
 """Exact nearest neighbours among a few thousand points, by brute force in compiled code.
 
-Trees are slower here: the points change every few episodes, so a tree would serve a few hundred
-queries, and in Hopper's 15 dimensions it prunes next to nothing. The points are dealt into 64
-groups, and the nearest of each group is kept while distances are computed. The k-th nearest of
-these bounds the distance of the k nearest points. Few other points are within the bound.
+Trees are slower here: the points change every few episodes, and in Hopper's 15 dimensions a tree
+prunes next to nothing. The points are dealt into 64 groups. The k-th smallest of the groups' least
+distances bounds the distance of the k nearest points, and few others are within it.
 """
 
 from typing import Any
@@ -77,8 +76,7 @@ def measure(
 ) -> Any:
     """Fill in the squared distances of a query to all points of `count` blocks, and the least.
 
-    Sums over the dimensions in order, by fused multiply-adds. blocks, query, distances and least
-    are addresses; `least` is [64], over the points at the same place in each block.
+    All but count and size are addresses; `least` is [64], over the same place in each block.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -167,8 +165,7 @@ lowest = unary(types.int64, types.uint64, lambda builder, x: builder.cttz(x, ir.
 how_many = unary(types.int64, types.uint64, lambda builder, x: builder.ctpop(x))
 
 
-# A point is one number: the bits of its squared distance, which sort as distances do, then its
-# place. So the nearest points are the smallest numbers, and the first of equally distant ones.
+# A point is one number: the bits of its squared distance, which sort as it does, then its place.
 PLACE = 2**32 - 1
 INFINITE = np.int32(0x7F800000)  # the bits of float32's Inf
 ALWAYS_WRITTEN = 4  # points of a block that are written down whether they are near or not
@@ -201,8 +198,7 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
             bits = within(place + 4 * BLOCK * b, bound)
             if b == block_count - 1:
                 bits &= ~np.uint64(0) >> np.uint64(block_count * BLOCK - total)
-            # Most blocks have none to three, which no processor can predict. Always writing four,
-            # of which the next block overwrites what is too many, is faster than a branch.
+            # Always writing four, and overwriting what is too many, is faster than a branch.
             end = found + how_many(bits)
             for k in range(ALWAYS_WRITTEN):
                 m = BLOCK * b + lowest(bits)

@@ -1,8 +1,7 @@
 """The compiled functions of a tanh network: outputs, and gradients by backpropagation (numba).
 
 For networks of 64 units the calls of a tensor library cost more than the work in them. All
-arithmetic is float32 in a fixed order, so the bits are the same on every processor, and for one
-state as for many.
+arithmetic is float32 in a fixed order: the same bits on every processor, for one state or many.
 
 A network is a flat vector of parameters and its sizes, int64 [layers + 1]. A layer's parameters are
 its weights and, as the last row, its biases, [in + 1, padded out]: columns of zeros are added up to

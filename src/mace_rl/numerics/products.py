@@ -4,13 +4,12 @@ Every element of a product is one chain of fused multiply-adds over k, in order:
 
     C[i, j] = fma(A[i, K-1], B[K-1, j], … fma(A[i, 1], B[1, j], fma(A[i, 0], B[0, j], start[i, j])))
 
-A fused multiply-add rounds once, as IEEE 754 says. So the number of elements that a processor
-computes at once does not matter, nor their order, nor where a chain is cut: its result so far is
-the next part's start. Libraries split the chains for speed, differently on each processor, which is
-why their last bits differ.
+A fused multiply-add rounds once, as IEEE 754 says. So it does not matter how many elements a
+processor computes at once, nor where a chain is cut and continued. Libraries split the chains,
+differently on each processor, so their last bits differ.
 
-A *tile* is a block of C that stays in registers while k runs. It is LLVM code with vectors of 16
-floats: one register of AVX-512 or two of AVX2. For each k it loads a row of B once.
+A *tile* is a block of C that stays in registers while k runs: LLVM code with vectors of 16 floats,
+one register of AVX-512 or two of AVX2.
 """
 
 from typing import Any, NamedTuple

@@ -117,10 +117,8 @@ class Run:
 
     def left(self, expected: float) -> float:
         """Seconds to its end: its own estimate, or as if it takes `expected` seconds."""
-        if not self.told:
-            return expected
-        known = own_estimate(self.told)
-        spent = self.told["seconds"] - self.told["start_seconds"]
+        known = own_estimate(self.told) if self.told else math.nan
+        spent = self.told["seconds"] - self.told["start_seconds"] if self.told else 0.0
         return expected - spent if math.isnan(known) else known
 
     def row(self) -> dict[str, str]:

@@ -94,7 +94,8 @@ def run(
                     after_episode(record)
             if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
                 clock.start_seconds = time.monotonic() - started
-            if clock.progress_due():
+            if time.monotonic() >= clock.next_progress:
+                clock.next_progress = time.monotonic() + clock.progress_seconds
                 observe(how_far(trainer, clock))
             if clock.checkpoint_due():
                 save()
@@ -193,14 +194,6 @@ class Clock:
     def elapsed(self) -> float:
         """Seconds of this run, those before interruptions included."""
         return time.monotonic() - self.start
-
-    def progress_due(self) -> bool:
-        """Whether `progress_seconds` have passed since this last returned True."""
-        now = time.monotonic()
-        if now < self.next_progress:
-            return False
-        self.next_progress = now + self.progress_seconds
-        return True
 
     def checkpoint_due(self) -> bool:
         """Whether it is time for a checkpoint."""

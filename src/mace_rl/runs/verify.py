@@ -1,7 +1,6 @@
 """Training kept runs again and comparing to the bit.
 
-With the same versions runs are equal on every processor. With others a last bit may differ, which
-training amplifies: the line of such a run says what changed.
+With the same versions they are equal on every processor; with others a last bit may differ.
 """
 
 import tempfile
