@@ -42,8 +42,7 @@ def settings(
     variant: what sets β: "ppo" (no bonus), "mace_fixed", "mace_full", or one of `config`.
     config: YAML files like config.yaml. They may have further variants.
     changes: any field of `RunConfig`, such as episodes=200, max_episode_steps=100 or
-        beta={"kind": "constant", "value": 0.2}. Sections merge: ppo={"clip": 0.1} changes only
-        `clip`.
+        beta={"kind": "constant", "value": 0.2}. Sections merge, as in ppo={"clip": 0.1}.
 
     Raises `ConfigError`, one line, for wrong settings.
     """

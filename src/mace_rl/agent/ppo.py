@@ -53,7 +53,8 @@ class PPO(ActorCritic, Stateful):
     """An actor and critics with the learner that trains them.
 
     The advantage of the total reward R_E + β R_I is A_E + β A_I, with a critic for each part:
-    "extrinsic" always, "intrinsic" with a bonus. The networks share no weights.
+    "extrinsic" always, "intrinsic" with a bonus. The networks share no weights, so the bonus
+    reaches the actor only through β.
     """
 
     STATE = ("learner", "normaliser", "generator", "reward_scales", "advantage_scales")
@@ -76,8 +77,8 @@ class PPO(ActorCritic, Stateful):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
-        observations: normalised, [T + 1, observation]; rewards: [T], before scaling. After a time
-        limit the critic says what the last state is worth. The unit is `reward_scale`.
+        observations: normalised, [T + 1, observation]; rewards: [T], before scaling. The last state
+        is worth 0 if it is terminal, else what the critic says. The unit is `reward_scale`.
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)

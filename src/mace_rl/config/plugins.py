@@ -19,10 +19,9 @@ from mace_rl.config.section import ConfigError, short_repr
 
 
 def code_outside(settings: Any) -> dict[str, str]:
-    """By key, every text in plain settings that may name code from outside this package.
+    """By key, every text in plain settings, arguments too, that may name code from outside.
 
-    That is every text with a ':', as in "package.module:Name" and ids of environments, also among
-    arguments.
+    That is every text with a ':', as in "package.module:Name" and ids of environments.
     """
     found, waiting = {}, [("", settings)]
     while waiting:

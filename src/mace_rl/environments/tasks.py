@@ -58,8 +58,8 @@ class DeepSea(gymnasium.Env):
 
     Every step leads one row down, and one column left or right as far as there is one. Right costs
     0.01 / `size`. Right in the last column, which only right all the way leads to, also gives 1. So
-    returns are 0.99 or at most 0. bsuite's seed draws for every cell which action is right: the
-    task is the same for every seed of the environment.
+    returns are 0.99 or at most 0. bsuite's seed, not the environment's, draws for every cell which
+    action is right.
 
     Observation: the number of the cell, row by row; `size`² after the last step.
     """

@@ -20,7 +20,7 @@ class NonFiniteError(Refusal, ArithmeticError):
 def require_finite(
     name: str, values: float | np.ndarray, where: str = "", too_large: float = math.inf
 ) -> None:
-    """`NonFiniteError`, with `where` after the number, unless all `values` are < `too_large`."""
+    """`NonFiniteError`, with `where` after the number, unless all |values| < `too_large`."""
     good = abs(values) < too_large if isinstance(values, float) else all_below(values, too_large)
     if not good:
         found = np.asarray(values)

@@ -145,11 +145,7 @@ def to_continue(
 
 
 def resume(trainer: Trainer, clock: "Clock", state: dict[str, Any]) -> None:
-    """Continue from the state in a checkpoint.
-
-    `run.json` gets the last episode before the interruption, the machine so far, and whether the
-    environment played the last episodes again to the bit.
-    """
+    """Continue from the state in a checkpoint, and note the interruption for `run.json`."""
     differs = resuming.replay_differs(trainer.environment, state["trainer"]["last_episodes"])
     trainer.load_state_dict(state["trainer"])  # after the replay, which drew random numbers
     logger.info("resuming after episode %d", len(trainer.records))
