@@ -80,7 +80,7 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
 
 @kernel
 def sample_categorical(logits, uniform):
-    """An action, and its log-probability, by the inverse distribution function at `uniform`."""
+    """An action from 0 and its log-probability; uniform: in [0, 1), where the CDF is inverted."""
     log_total = log_sum_exp(logits)
     cumulative = 0.0
     action = len(logits) - 1  # stays if rounding leaves the sum below `uniform`

@@ -53,7 +53,7 @@ class Learner(Protocol):
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
     ) -> Update:
-        """Descend PPO's losses in all minibatches; returns: λ-returns of each critic's reward."""
+        """Descend PPO's losses in all minibatches; returns: each critic's λ-returns, [N]."""
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]

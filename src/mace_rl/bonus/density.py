@@ -12,7 +12,7 @@ SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have i
 
 
 class MaskedAutoencoder(torch.nn.Module):
-    """μ_i and log σ_i, each a function of the inputs before the i-th: [N, size] → [N, 2 size].
+    """μ_i and log σ_i, functions of the inputs before the i-th: [N, size] → [N, 2 size].
 
     One hidden layer with tanh. Masked weights start at 0, and their gradient is 0.
     """

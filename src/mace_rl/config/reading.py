@@ -91,8 +91,7 @@ _SCALARS = [
 class _Loader(yaml.SafeLoader):
     """YAML's safe loader, with the scalars of YAML 1.2.
 
-    Errors are: a key that occurs twice, a list or mapping as a key, a tag, and too much depth or
-    repetition by aliases.
+    It refuses repeated keys, lists or mappings as keys, tags, and too much depth or repetition.
     """
 
     def __init__(self, stream: str) -> None:

@@ -19,8 +19,8 @@ OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermo
 def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
     """What the next episode depends on, as far as it can be known.
 
-    That is the environment's generator, its own `state_dict()` if it has one, and, if `of_process`,
-    which takes longer, the global generators.
+    The environment's generator, its own `state_dict()` if any, and, which takes longer, the global
+    generators if `of_process`.
     """
     env: Any = environment.env
     offers = all(map(env.has_wrapper_attr, OFFERED))

@@ -50,10 +50,7 @@ def quantile(values: np.ndarray, share: float) -> float:
 
 @kernel
 def shuffled(draws: np.ndarray) -> np.ndarray:
-    """K permutations of N, int64 [K, N], by Fisher and Yates, from uniform draws in [0, 1), [K, N].
-
-    Draws of 1 leave the order as it is.
-    """
+    """K permutations by Fisher and Yates from uniform draws, [K, N]; draws of 1 change nothing."""
     order = np.empty(draws.shape, np.int64)
     for k in range(len(draws)):
         for n in range(draws.shape[1]):

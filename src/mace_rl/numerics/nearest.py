@@ -165,7 +165,8 @@ lowest = unary(types.int64, types.uint64, lambda builder, x: builder.cttz(x, ir.
 how_many = unary(types.int64, types.uint64, lambda builder, x: builder.ctpop(x))
 
 
-# A point is one number: the bits of its squared distance, which sort as it does, then its place.
+# A point is one number: the bits of its squared distance, which sort as it does, then its place. So
+# the nearest are the smallest numbers, and of equally distant ones the first.
 PLACE = 2**32 - 1
 INFINITE = np.int32(0x7F800000)  # the bits of float32's Inf
 ALWAYS_WRITTEN = 4  # points of a block that are written down whether they are near or not

@@ -18,8 +18,7 @@ from mace_rl.runs.finished import FinishedRun
 def write_all(folder: Path, out: Path) -> int:
     """Write the events of every run in and below `folder` to the same places below `out`.
 
-    Returns the number of runs. Raises `RecordError` if there are none or records are damaged, and
-    `Refusal` without tensorboardX.
+    Returns their number. `RecordError` for none or damaged ones, `Refusal` without tensorboardX.
     """
     runs = files.runs_below(folder, [files.RECORD, files.CHECKPOINT])
     if not runs:

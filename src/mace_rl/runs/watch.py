@@ -105,10 +105,9 @@ def film(
     width: int = 300,
     seconds: float = 10.0,
 ) -> Film:
-    """The first `episodes` that `evaluate` plays with the agent in `directory`.
+    """The first `episodes` that `evaluate` plays; untrained: with the agent before training.
 
-    untrained: as it was before training. Raises what `load_agent` raises, and `RenderError` if the
-    environment cannot be drawn.
+    Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
     run = FinishedRun(directory, trust)
     config = run.config
