@@ -1,4 +1,4 @@
-"""The files of a run, and writing files as a whole."""
+"""The files of a run, and how files are written and found."""
 
 import itertools
 import os

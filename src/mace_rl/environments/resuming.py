@@ -72,7 +72,7 @@ class LastEpisodes:
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
-    """How a new environment plays `LastEpisodes.blocks` again otherwise; "" if equally."""
+    """What is different if a new environment plays `LastEpisodes.blocks` again; "" if nothing."""
     for one in itertools.chain.from_iterable(blocks):
         set_state(environment, one["start"])
         try:

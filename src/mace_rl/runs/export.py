@@ -11,7 +11,7 @@ from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
 
 RUN = ("task", "algorithm", "seed")  # environment, variant, seed
-EPISODE = {"step": "env_steps", "return": "extrinsic_return"}  # our names of other columns
+EPISODE = {"step": "env_steps", "return": "extrinsic_return"}  # our names of the other columns
 EPISODE |= {name: name for name in ("episode", "length", "beta")}
 
 
