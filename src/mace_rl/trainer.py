@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.advantages import normalised, normalised_change, paid_returns
 from mace_rl.agent.learner import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
@@ -126,7 +126,8 @@ class Trainer:
                 "intrinsic", observations, reward, episode.terminated
             )
             intrinsic_scale = self.ppo.advantage_scale("intrinsic")
-            self.curiosity.remember(episode, extrinsic_returns * self.ppo.reward_scale("extrinsic"))
+            paid = paid_returns(episode.rewards, self.config.ppo.discount)
+            self.curiosity.remember(episode, paid)
             self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
