@@ -14,11 +14,18 @@ gymnasium.register(
 gymnasium.register(
     "NoisyMountainCar-v0", "mace_rl.environments.tasks:NoisyMountainCar", max_episode_steps=200
 )
+for size, pages in ((6, 500), (7, 1000), (10, 1000)):
+    gymnasium.register(
+        f"NoisyDeepSea{size}-v0",
+        "mace_rl.environments.tasks:NoisyDeepSea",
+        max_episode_steps=size,
+        kwargs={"size": size, "pages": pages},
+    )
 gymnasium.register(
-    "NoisyDeepSea10-v0",
-    "mace_rl.environments.tasks:NoisyDeepSea",
-    max_episode_steps=10,
-    kwargs={"size": 10, "pages": 1000},
+    "LateDeepSea7-v0",
+    "mace_rl.environments.tasks:LateDeepSea",
+    max_episode_steps=12,
+    kwargs={"size": 7, "pages": 1000},
 )
 for size in (10, 20):
     gymnasium.register(
