@@ -177,7 +177,7 @@ def status(arguments: argparse.Namespace) -> None:
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
     _require(arguments.seed >= 0, "--seed", arguments.seed, "be at least 0")
-    _ = FinishedRun(arguments.folder, arguments.trust).config  # before PyTorch, which takes seconds
+    _ = FinishedRun(arguments.folder, arguments.trust).agent_config  # before PyTorch, which is slow
 
 
 def evaluate(arguments: argparse.Namespace) -> None:

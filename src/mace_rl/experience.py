@@ -54,13 +54,3 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
 def total_advantages(rollout: list[Experience]) -> np.ndarray:
     """A_E + β A_I of every step, float64 [N]."""
     return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
-
-
-def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
-    """For each episode what `total_advantages` changes by with its β: A_I there, 0 elsewhere."""
-    parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
-    start = 0
-    for part, item in zip(parts, rollout, strict=True):
-        part[start : start + len(item.episode)] = item.intrinsic_part
-        start += len(item.episode)
-    return list(parts)

@@ -33,9 +33,8 @@ def digest(part: str, *own: Path) -> str:
 def files(part: str) -> list[Path]:
     """The source files of this package: "everything", or what a "training" depends on."""
     left_out = [PACKAGE / name for name in NO_PART] if part == "training" else []
-    return sorted(
-        file for file in PACKAGE.rglob("*.py") if not {file, *file.parents}.intersection(left_out)
-    )
+    found = [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.npz")]  # the meta network's weights
+    return sorted(file for file in found if not {file, *file.parents}.intersection(left_out))
 
 
 @cache  # of code that is imported, and so stays in this process what it was

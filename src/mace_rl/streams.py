@@ -1,7 +1,7 @@
 """One independent random stream per component, so that no component disturbs another's draws.
 
-This is what makes β = 0 equal to plain PPO to the bit: memory, novelty and the meta network draw
-from streams of their own.
+This is what makes β = 0 equal to plain PPO to the bit: novelty and what sets β draw from streams
+of their own.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ STREAMS = (
     "intrinsic_critic",
     "density",
     "density_batches",
-    "meta",
+    "meta",  # not drawn from any more
     "novelty",
     "beta",
     "bonus",

@@ -21,12 +21,10 @@ IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # what only variants with a bonus use
 
 
-class RunConfig(Section):
-    """One training run: environment, variant, seed and every hyperparameter that it uses.
+class AgentConfig(Section):
+    """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
-    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
-    others, so that a change of what a variant does not use leaves its runs alone.
-    """
+    model_config = Section.model_config | {"extra": "ignore"}
 
     environment: str
     variant: str
@@ -37,6 +35,17 @@ class RunConfig(Section):
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+
+class RunConfig(AgentConfig):
+    """One training run: environment, variant, seed and every hyperparameter that it uses.
+
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    others, so that a change of what a variant does not use leaves its runs alone.
+    """
+
+    model_config = Section.model_config
+
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
