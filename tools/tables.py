@@ -61,8 +61,9 @@ def make(name: str, study: dict[str, Any]) -> None:
     command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
-    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    done = subprocess.run(command, cwd=folder, **piped)
+    done = subprocess.run(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     if done.returncode:
         raise ValueError(f"{name}: {done.stdout.strip()}")
 

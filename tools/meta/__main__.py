@@ -94,8 +94,8 @@ def as_one(learners: Sequence[Learner]) -> dict[str, np.ndarray]:
             bias[gate, part] = theirs["bias_ih_l0"][rows] + theirs["bias_hh_l0"][rows]
         readout[part] = learner.readout.weight.detach().numpy()[0] / len(learners)
         readout_bias += learner.readout.bias.item() / len(learners)
-    gates = (part.reshape(*part.shape[:-2], -1) for part in (inputs, recurrent, bias))
-    weights = MetaNetwork(*gates, readout, readout_bias)
+    gates = inputs.reshape(Gauge.SIZE, -1), recurrent.reshape(size, -1)
+    weights = MetaNetwork(*gates, bias.ravel(), readout, readout_bias)
     return {name: part.astype(np.float32) for name, part in weights._asdict().items()}
 
 
