@@ -17,7 +17,6 @@ from gymnasium.spaces import Box, Discrete
 
 from mace_rl import cli
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
-from mace_rl.beta.lstm import CompiledMetaNetwork
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.files import LOCK
@@ -42,7 +41,7 @@ GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes":
 class Twin:
     """A network, or a policy, as its torch module in float64: outputs, gradients by autograd."""
 
-    def __init__(self, owner: Network | CompiledMetaNetwork | Policy) -> None:
+    def __init__(self, owner: Network | Policy) -> None:
         self.network = getattr(owner, "network", owner)
         self.module = copy.deepcopy(self.network.module()).double()
         log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
@@ -78,7 +77,7 @@ class Twin:
         return torch.distributions.Categorical(logits=outputs)
 
 
-def laid_out(network: Network | CompiledMetaNetwork, arrays: list[np.ndarray]) -> np.ndarray:
+def laid_out(network: Network, arrays: list[np.ndarray]) -> np.ndarray:
     """Arrays like its module's parameters as one vector like the network's.
 
     A compiled network has its columns filled up to a multiple of 16 with zeros. What follows the
@@ -93,16 +92,7 @@ def laid_out(network: Network | CompiledMetaNetwork, arrays: list[np.ndarray]) -
     if isinstance(network, CompiledMLP):  # each layer's weights with the biases as a last row
         layers = zip(arrays[::2], arrays[1::2], strict=True)
         arrays = [filled(np.vstack([weights.T, biases])) for weights, biases in layers]
-    elif isinstance(network, CompiledMetaNetwork):
-        *gates, readout, readout_bias = arrays
-        gates = [filled(part.reshape(*part.shape[:-1], 4, -1)) for part in gates]
-        arrays = [*gates, filled(readout), readout_bias]
     return np.concatenate([part.ravel() for part in [*arrays, *rest]])
-
-
-def beta_of(twin: Twin, sequence: np.ndarray) -> torch.Tensor:
-    """The logistic function of the reference network's answer to what an episode was, [1]."""
-    return torch.sigmoid(twin(sequence))
 
 
 def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:

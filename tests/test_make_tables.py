@@ -23,14 +23,15 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
         shutil.copy(ROOT / name, tmp_path)
     small = {"environments": ["CartPole-v1"], "variants": ["ppo"], "seeds": [0, 1]}
     small |= {"training": {"episodes": 60}, "metrics": {"comparisons": []}}
-    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))
-    study = read_study([tmp_path / "config.yaml", tmp_path / "small.yaml"])
+    (tmp_path / "config/small.yaml").write_text(yaml.safe_dump(small))
+    study = read_study([tmp_path / "config.yaml", tmp_path / "config/small.yaml"])
     for seed in (0, 1):
         folder = tmp_path / f"results/runs/CartPole-v1/ppo/seed{seed}"
         run(study.run_config("CartPole-v1", "ppo", seed), folder)
     kept_runs.pack(tmp_path / "results", tmp_path / "reference/study")
     wanted = {
-        "configfiles": ["small.yaml"],
+        "configuration": "config",
+        "configfiles": ["config/small.yaml"],
         "config": [],
         "outputs": ["metrics.csv", "figure1.png"],
     }

@@ -1,5 +1,6 @@
 """A finished run's agent: torch modules that act as the trainer does, alone or in `evaluate`."""
 
+import json
 import shutil
 
 import gymnasium
@@ -9,8 +10,10 @@ import torch
 from shared import LAYER_NORM, call, finish, likeliest
 
 from mace_rl.config.reading import merge
+from mace_rl.config.section import ConfigError
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.evaluate import evaluate
+from mace_rl.runs.finished import FinishedRun
 
 
 @pytest.mark.parametrize(
@@ -80,6 +83,23 @@ def test_an_agent_plays_as_at_the_end_of_its_training(
     capsys.readouterr()
     assert call(monkeypatch, "evaluate", str(tmp_path), "--episodes", "3") == (0, "")
     assert capsys.readouterr().out.startswith("3 episodes: mean return ")
+
+
+def test_an_agent_plays_whatever_version_of_the_method_trained_it(trained, tmp_path):
+    """What playing does not need may have other settings; what it needs may not."""
+    folder = trained("CartPole-v1", episodes=3)
+    expected = evaluate(folder, 2, 5)
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    record["config"] |= {"meta": {"hidden_units": 128, "prior": 0.1}, "beta": {"kind": "older"}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert (evaluate(tmp_path, 2, 5) == expected).all()
+    with pytest.raises(ConfigError, match=r"run\.json: the key .meta\.pretrained"):
+        _ = FinishedRun(tmp_path).config
+    record["config"]["ppo"]["clpi"] = 0.2
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match=r"unknown key .ppo\.clpi"):
+        evaluate(tmp_path, 2, 5)
 
 
 def test_without_chance_discrete_actions_are_the_most_probable(trained):

@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from invented import LITERAL, PAPERS, QUESTIONS, ROBUST
+from invented import LITERAL, ROBUST
 
 from mace_rl import files
+from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
 from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import CORRELATION
 from tools import kept_runs
 
-[CLAIMED], [ASKED] = PAPERS.families.values(), QUESTIONS.families.values()
 ROOT = Path(__file__).parents[1]
+CONFIRMATION = ROOT / "reference" / "confirmation"
+CLAIMS = parse_claims(CONFIRMATION / "claims.yaml")
+CLAIMED, ASKED = CLAIMS.families.values()
 BARREN = "BarrenRegion-v0"
 PAGE = ROOT / "docs" / "protocol.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -45,7 +48,7 @@ def test_claims_are_measured_as_the_page_says(name: str) -> None:
 
 def test_questions_have_the_parts_that_the_page_has() -> None:
     count = {
-        name: sum(len(part.each(QUESTIONS.table1)) for part in claim.parts[ROBUST])
+        name: sum(len(part.each(CLAIMS.table1)) for part in claim.parts[ROBUST])
         for name, claim in ASKED.claims.items()
     }
     # By its words: five tasks; three; three times five others; four; one and one.
@@ -60,7 +63,7 @@ def test_questions_have_the_parts_that_the_page_has() -> None:
 def test_configurations_have_the_runs_that_the_page_has() -> None:
     runs = {}
     for name in ("study", "questions"):
-        study = read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"])
+        study = read_study([ROOT / "config.yaml", CONFIRMATION / f"{name}.yaml"])
         for env, variant, seed in study.runs():
             runs.setdefault(name, {}).setdefault((env, variant), []).append(seed)
     assert all(seeds == list(range(100, 120)) for seeds in runs["study"].values())
@@ -86,7 +89,7 @@ def test_every_run_is_kept_and_came_after_the_page_and_from_one_state_of_the_cod
     assert records.keys() == {
         run
         for name in ("study", "questions")
-        for run in read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"]).runs()
+        for run in read_study([ROOT / "config.yaml", CONFIRMATION / f"{name}.yaml"]).runs()
     }
     ((commit, dirty),) = {tuple(record["code"].values()) for record in records.values()}
     assert not dirty and len({record["sources"] for record in records.values()}) == 1

@@ -16,6 +16,7 @@ CHANGES = [  # of a file, and whether a training has other sources then
     ("records.py", True),
     ("study/show/report.py", False),
     ("a_new_file.py", True),
+    ("beta/weights.npz", True),
 ]
 
 

@@ -152,7 +152,7 @@ def test_mistake_is_named_in_one_line(line: str) -> None:
 
 LAYERS = """
 training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}, beta: {kind: constant, value: 0.4}}
-environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {hidden_units: 2}}}
+environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {horizon: 2}}}
 variant_settings: {mace_full: {episodes: 3, ppo: {discount: 0.3}}}
 """
 
@@ -169,7 +169,7 @@ def test_settings_go_over_one_another_in_order() -> None:
     both = study.run_config("CartPole-v1", "mace_full", 0)
     assert (both.episodes, both.ppo.clip, both.ppo.discount) == (3, 0.2, 0.3)
     assert (both.environment, both.variant) == ("CartPole-v1", "mace_full")
-    assert both.meta.hidden_units == 2
+    assert both.meta.horizon == 2
 
 
 SECTIONS = {"memory", "novelty", "meta"}
@@ -181,7 +181,7 @@ SECTIONS = {"memory", "novelty", "meta"}
 )
 def test_a_run_holds_the_sections_that_its_variant_uses(variant: str, used: set[str]) -> None:
     """So that a change of the others leaves its settings, and with them its runs, alone."""
-    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"hidden_units": 7}}
+    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"horizon": 7}}
     plain, other = (
         load_study(changed({"training": training}), "test").run_config("CartPole-v1", variant, 0)
         for training in ({}, over)

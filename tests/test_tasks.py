@@ -182,6 +182,23 @@ def test_the_archive_of_the_noisy_deep_sea():
     assert kstest(pages, "uniform", args=(101, 1000)).pvalue > 0.01
 
 
+@pytest.mark.parametrize("late", range(7))
+def test_the_archive_of_the_late_deep_sea_is_beside_its_goal(late):
+    """Right all along but for one third action, which is 0 in five rows and the door in two."""
+    env, plain = gymnasium.make("LateDeepSea7-v0"), DeepSea(7)
+    actions = [plain.right[8 * row] for row in range(7)]
+    assert play(env, actions)[1:] == (pytest.approx([-0.01 / 7] * 6 + [1 - 0.01 / 7]), True)
+    actions[late] = 2
+    observations, rewards, terminated = play(env, [*actions, 0, 1, 2, 0, 1])
+    if late < 5:
+        actions[late] = 0
+        assert (observations, rewards, terminated) == play(plain, actions)
+    else:  # no action leads out, up to the time limit
+        assert rewards[late:] == [-0.001] * (12 - late) and not terminated
+        assert min(observations[late + 1 :]) >= 50 > max(observations[: late + 1])
+    check_env(env.unwrapped, skip_render_check=True)
+
+
 # --- Barren region ------------------------------------------------------------------------------
 
 

@@ -362,7 +362,7 @@ def test_defaults_are_the_study_s():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"beta": {"kind": "meta", "initial": 0.4}}, "meta network learns from policy gradients"),
+        ({"beta": {"kind": "meta", "initial": 0.4}}, "asks for policy gradients and the budget"),
         (
             {"beta": OWN | {"arguments": {"learns": True}}},
             "beta.rule has 'test_wrappers:Own', which learns from policy gradients",

@@ -104,7 +104,9 @@ def _require_at_least(smallest: int, arguments: argparse.Namespace, *names: str)
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require_at_least(1, arguments, "episodes")
     _require_at_least(0, arguments, "seed")
-    _ = FinishedRun(arguments.folder, arguments.trust).config  # before PyTorch, which takes seconds
+    _ = FinishedRun(
+        arguments.folder, arguments.trust
+    ).agent_config  # before PyTorch, which takes seconds
 
 
 def run_config(arguments: argparse.Namespace) -> RunConfig:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 
-from mace_rl.agent.advantages import generalised_advantages
+from mace_rl.agent.advantages import paid_returns
 from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.beta.controller import BetaController
@@ -124,9 +124,7 @@ class CuriosityTracker(Stateful):
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
         self.scales["extrinsic"].update(episode.rewards)
         self.scales["curiosity"].update(bonus)
-        values = np.zeros(len(episode) + 1)  # no critic: with λ = 1, discounted sums of rewards
-        returns = generalised_advantages(episode.rewards, values, self.config.discount, 1.0)
-        self.curiosity.remember(episode, returns)
+        self.curiosity.remember(episode, paid_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
         if self.steps >= self.config.rollout_steps:

@@ -54,12 +54,3 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
 def total_advantages(rollout: list[Experience]) -> np.ndarray:
     """A_E + β A_I of every step, float64 [N]."""
     return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
-
-
-def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
-    """The derivative of `total_advantages` by each episode's β: A_I there, 0 elsewhere."""
-    ends = np.cumsum([len(item.episode) for item in rollout])
-    parts = np.zeros((len(rollout), ends[-1]))
-    for part, item, end in zip(parts, rollout, ends, strict=True):
-        part[end - len(item.episode) : end] = item.intrinsic_part
-    return list(parts)

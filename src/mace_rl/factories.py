@@ -28,7 +28,7 @@ from mace_rl.config.beta import (
 )
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
@@ -45,7 +45,7 @@ def beta_controller(
             return None
         case MetaBeta(initial=initial):
             assert config.meta is not None  # `RunConfig` checked that
-            return MetaAdaptation(config.meta, initial, environment, streams["meta"])
+            return MetaAdaptation(config.meta, initial, config.episodes)
         case rule:
             return beta_rule(rule, streams["beta"])
 
@@ -77,14 +77,14 @@ def intrinsic_reward(
             return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 
-def environment(config: RunConfig, streams: Streams) -> Environment:
+def environment(config: AgentConfig, streams: Streams) -> Environment:
     """The environment that the agent acts in."""
     limits = config.max_episode_steps, config.environment_arguments
     return Environment(config.environment, streams.sequence("environment"), *limits)
 
 
 def actor_critic(
-    config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams
+    config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams
 ) -> ActorCritic:
     """The untrained policy and critics, one for each kind of reward."""
     settings, size = config.ppo, spaces.observation_size
@@ -108,6 +108,6 @@ def actor_critic(
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
 
 
-def ppo(config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
+def ppo(config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
     """Policy and critics with their learner."""
     return PPO(actor_critic(config, spaces, intrinsic, streams), streams["minibatches"])

@@ -31,7 +31,7 @@ def digest(part: str, *own: Path) -> str:
 def files(part: str) -> list[Path]:
     """The source files of this package: "everything", or what a "training" depends on."""
     left_out = {PACKAGE / name for name in NO_PART} if part == "training" else set()
-    found = PACKAGE.rglob("*.py")
+    found = [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.npz")]  # the meta network's weights
     return sorted(file for file in found if left_out.isdisjoint({file, *file.parents}))
 
 

@@ -1,6 +1,6 @@
 """One independent random stream per component, so that no component disturbs another's draws.
 
-So β = 0 equals plain PPO to the bit: memory, novelty and meta network draw from their own streams.
+So β = 0 equals plain PPO to the bit: memory and novelty draw from streams of their own.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 # A stream's place here is its key, so new streams go at the end.
 STREAMS = (
     *("environment", "actions", "minibatches", "actor", "extrinsic_critic", "intrinsic_critic"),
-    *("density", "density_batches", "meta", "novelty", "beta", "bonus"),
+    *("density", "density_batches", "meta", "novelty", "beta", "bonus"),  # meta: not drawn from
 )
 
 

@@ -82,7 +82,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
         Gymnasium's `FlattenObservation` makes vectors of others. Episodes have to end, if need be
         by a time limit: nothing is learned from one that does not.
     beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
-        "exponential", …} or "custom". Not "meta", which learns from policy gradients.
+        "exponential", …} or "custom". Not "meta", which asks for policy gradients.
     relevance: False for novelty alone, without memory; `memory` is then refused.
     memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
     discount: γ of the agent (gamma in stable-baselines3), per step.

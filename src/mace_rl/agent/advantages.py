@@ -26,6 +26,14 @@ def generalised_advantages(
     return result
 
 
+def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
+    """The discounted return-to-go of each step as it was paid, [T].
+
+    Without what a critic guesses for the rest, which early on differs by more than what is paid.
+    """
+    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)
+
+
 @kernel
 def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
     """Advantages with root mean square 1, float64 [N]; if `centred`, with mean 0 too.

@@ -19,11 +19,10 @@ IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 
 
-class RunConfig(Section):
-    """One training run: environment, variant, seed and every hyperparameter that it uses.
+class AgentConfig(Section):
+    """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
-    Sections that a variant does not use are None, so that changing them does not concern its runs.
-    """
+    model_config = Section.model_config | {"extra": "ignore"}
 
     environment: str
     variant: str
@@ -34,6 +33,17 @@ class RunConfig(Section):
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+
+class RunConfig(AgentConfig):
+    """One training run: environment, variant, seed and every hyperparameter that it uses.
+
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    others, so that a change of what a variant does not use leaves its runs alone.
+    """
+
+    model_config = Section.model_config
+
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None

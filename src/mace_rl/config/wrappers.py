@@ -48,7 +48,7 @@ class CuriosityConfig(Section):
             return {"kind": "constant", "value": beta}
         if beta.get("kind") == "meta":
             raise ValueError(
-                "the meta network learns from policy gradients, which only our trainer has: kind "
-                "should be constant, exponential or custom"
+                "meta-adaptation asks for policy gradients and the budget, which only our trainer "
+                "has: kind should be constant, exponential or custom"
             )
         return beta

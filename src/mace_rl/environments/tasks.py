@@ -8,6 +8,8 @@ CliffWalking200-v0              -13; random actions find the cliff, at -100 a fa
 BarrenRegion-v0                 1; endless novelty elsewhere
 NoisyMountainCar-v0             1; the same, as a television that an action switches on
 NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
+NoisyDeepSea6-v0, …7-v0         0.99; an archive much larger than the sea: a bonus does harm
+LateDeepSea7-v0                 0.99; an archive beside the goal: the right β changes
 """
 
 from typing import Any, ClassVar
@@ -119,6 +121,26 @@ class NoisyDeepSea(DeepSea):
         self.row += 1
         page = self.cells + int(self.np_random.integers(self.pages))
         return page, -0.001, self.row == self.size, False, {}
+
+
+class LateDeepSea(NoisyDeepSea):
+    """DeepSea with an archive of `pages` pages beside its goal: the right β changes.
+
+    In the last two cells of the diagonal a third action leads into the archive, where each step
+    costs 0.001 and shows a page drawn anew, until the time limit. Elsewhere the third action does
+    what 0 does. Without a bonus the diagonal is hardly found; if the bonus stays large, the policy
+    that has found it turns aside for news.
+
+    Observation: as in NoisyDeepSea.
+    """
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """One row down, or another page."""
+        self.reading |= action == 2 and self.row == self.column >= self.size - 2
+        if not self.reading:
+            return DeepSea.step(self, action % 2)
+        page = self.cells + int(self.np_random.integers(self.pages))
+        return page, -0.001, False, False, {}
 
 
 class BarrenRegion(gymnasium.Env):

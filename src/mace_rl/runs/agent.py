@@ -18,7 +18,7 @@ from mace_rl import files
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig
 from mace_rl.factories import actor_critic, environment
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
@@ -85,7 +85,7 @@ def load_agent(directory: str | Path, trust: bool = False) -> Agent:
 class Player:
     """The environment of a run and its agent, untrained at first, without a trainer."""
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: AgentConfig) -> None:
         streams = Streams(config.seed)
         self.environment = environment(config, streams)
         self.networks = actor_critic(config, self.environment, config.bonus is not None, streams)
@@ -94,7 +94,7 @@ class Player:
     @classmethod
     def of(cls, run: FinishedRun) -> "Player":
         """With the trained agent of `run`; raises what `load_agent` raises."""
-        player = cls(run.config)
+        player = cls(run.agent_config)
         player._load(run.agent_state, run.folder / files.AGENT)
         return player
 

@@ -6,11 +6,11 @@ import io
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl import files
 from mace_rl.config.plugins import code_outside
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 from mace_rl.runs.provenance import difference, identity, read_record
@@ -18,6 +18,7 @@ from mace_rl.runs.provenance import difference, identity, read_record
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
 
+Config = TypeVar("Config", bound=AgentConfig)
 NEVER_WRITTEN = "not as a training writes it"
 WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
@@ -46,12 +47,20 @@ class FinishedRun:
 
     @cached_property
     def config(self) -> RunConfig:
-        """Its configuration. The code that it names is not imported.
+        """Its configuration, to train by. The code that it names is not imported.
 
         Raises `ConfigError` if it is wrong, or names code from outside without `trust`.
         """
+        return self._checked(RunConfig)
+
+    @cached_property
+    def agent_config(self) -> AgentConfig:
+        """The same, of what playing needs: other settings may be of another version."""
+        return self._checked(AgentConfig)
+
+    def _checked(self, model: type[Config]) -> Config:
         origin, values = str(self.folder / files.RECORD), self.record["config"]
-        config = check(RunConfig, values, origin)
+        config = check(model, values, origin)
         for key, text in ({} if self.trust else code_outside(values)).items():
             raise ConfigError(
                 f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: "

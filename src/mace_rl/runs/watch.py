@@ -110,7 +110,7 @@ def film(
     Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
     run = FinishedRun(directory, trust)
-    config = run.config
+    config = run.agent_config
     player = Player(config) if untrained else Player.of(run)
     environment, policy = player.environment, player.acting(deterministic)
     # Closed before another is made: pybullet loses other simulators when one is collected.
