@@ -57,7 +57,10 @@ def test_schedules_by_hand(run_config, beta, expected):
 @pytest.mark.parametrize(
     ("beta", "message"),
     [
-        ({"kind": "constant", "value": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
+        (
+            {"kind": "constant", "value": 10.5},
+            "beta.value is 10.5, but .* less than or equal to 10",
+        ),
         ({"kind": "constant"}, "the key 'beta.value' is missing"),
         (SCHEDULE | {"floor": 0.5}, "beta .* floor is 0.5, which must not exceed initial, 0.4"),
         (SCHEDULE | {"flor": 0.1}, "unknown key 'beta.flor' .* 'floor'"),

@@ -160,7 +160,7 @@ def test_another_paper_has_its_tables_verdicts_and_pictures(folder):
         ("chain.yaml", "    max_episode_steps: 50\n", "", "max_episode_steps should set one"),
         ("chain.yaml", "length: 8", "size: 8", "unexpected keyword argument 'size'"),
         ("linear_decay.yaml", "{initial: 0.4, episodes: 10}", "{start: 1}", "'start'"),
-        ("linear_decay.yaml", ": 0.4", ": 1.5", "episode 1: β is 1.5, which is"),
+        ("linear_decay.yaml", ": 0.4", ": 10.5", "episode 1: β is 10.5, which is"),
         ("grid_counts.yaml", "kind: custom", "kind: counts", "estimator and kind: custom"),
         ("grid_counts.py", "1 / (1", "2 / (1", "the curiosity bonus is 2.0, which is"),
         ("grid_counts.py", "(states)])", "(states)][:1])", "the novelty is float64 of shape (1,)"),

@@ -243,8 +243,8 @@ def test_a_rule_of_the_user_s_own_sees_whole_episodes():
     assert bonus.tolist() == [info["curiosity"] for *_, info in found[:200]]
     assert first.rewards.tolist() == [info["reward_extrinsic"] for *_, info in found[:200]]
     assert (first.observations[1:] == [item[0] for item in found[:200]]).all()
-    env = CuriosityReward(gymnasium.make("Pendulum-v1"), OWN | {"arguments": {"beta": 1.5}})
-    with pytest.raises(NonFiniteError, match=r"β is 1\.5"):
+    env = CuriosityReward(gymnasium.make("Pendulum-v1"), OWN | {"arguments": {"beta": 10.5}})
+    with pytest.raises(NonFiniteError, match=r"β is 10\.5"):
         env.reset()
 
 
@@ -368,7 +368,7 @@ def test_defaults_are_the_study_s():
             "beta.rule has 'test_wrappers:Own', which learns from policy gradients",
         ),
         ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),
-        ({"beta": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
+        ({"beta": 10.5}, "beta.value is 10.5, but .* less than or equal to 10"),
         ({"memory": {"capcity": 5}}, "unknown key 'memory.capcity' .* 'capacity'"),
         ({"memory": 5}, "memory is 5, but"),
         ({"relevance": False, "memory": {}}, "relevance False does not use memory"),

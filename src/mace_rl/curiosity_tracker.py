@@ -21,6 +21,7 @@ from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
 from mace_rl.numerics.finite import require_within
+from mace_rl.records import LARGEST_BETA
 from mace_rl.state import Stateful
 from mace_rl.streams import Streams
 
@@ -85,7 +86,7 @@ class CuriosityTracker(Stateful):
     def begin(self, environment: int, observation: Any) -> None:
         """Start an episode; an unfinished one is forgotten."""
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
-        require_within("β", beta)
+        require_within("β", beta, largest=LARGEST_BETA)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
     def reward_parts(

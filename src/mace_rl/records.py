@@ -17,6 +17,8 @@ import numpy as np
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 
+LARGEST_BETA = 10.0  # the paper has at most 1; larger constants are there to compare
+
 if TYPE_CHECKING:  # training only writes, without pandas
     import pandas as pd
 
@@ -204,7 +206,7 @@ def _check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None
         "env_steps": (steps == np.cumsum(length), "the sum of the lengths so far"),
         "extrinsic_return": (np.isfinite(returns), "finite"),
         "intrinsic_return": (np.isfinite(bonus) & (bonus >= 0), "finite and >= 0"),
-        "beta": ((beta >= 0) & (beta <= 1), "in [0, 1]"),
+        "beta": ((beta >= 0) & (beta <= LARGEST_BETA), f"in [0, {LARGEST_BETA:g}]"),
         "terminated": ((ended >= 0) & (ended <= 1), "0 or 1"),
     }
     wrong = [(int(np.argmin(fits)), name) for name, (fits, _) in rules.items() if not fits.all()]

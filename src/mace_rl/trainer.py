@@ -27,7 +27,7 @@ from mace_rl.experience import Experience, joined, steps, total_advantages
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
-from mace_rl.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
+from mace_rl.records import LARGEST_BETA, EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.refusal import Refusal
 from mace_rl.streams import Streams
 
@@ -110,7 +110,7 @@ class Trainer:
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta = float(numbers("β", self.controller.beta, ()))
-            require_within("β", beta)
+            require_within("β", beta, largest=LARGEST_BETA)
             bonus = self.curiosity.bonus(episode)
             reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
             largest = min(self.curiosity.largest, TOO_LARGE)

@@ -81,7 +81,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     env: observations are Box (flattened) or Discrete, actions Discrete or one-dimensional Box;
         Gymnasium's `FlattenObservation` makes vectors of others. Episodes have to end, if need be
         by a time limit: nothing is learned from one that does not.
-    beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
+    beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …} or "custom". Not "meta", which asks for policy gradients.
     relevance: False for novelty alone, without memory; `memory` is then refused.
     memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.

@@ -28,7 +28,7 @@ class BetaController(ABC):
     @property
     @abstractmethod
     def beta(self) -> float:
-        """β of the next episode, in [0, 1]."""
+        """β of the next episode, in [0, 10]; the paper has at most 1."""
 
     @abstractmethod
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from mace_rl.config.section import Arguments, Count, Reference, Section
+from mace_rl.records import LARGEST_BETA
 
 
 class MetaConfig(Section):
@@ -27,7 +28,7 @@ class ConstantBeta(Section):
     """The same β in every episode."""
 
     kind: Literal["constant"]
-    value: float = Field(ge=0, le=1)
+    value: float = Field(ge=0, le=LARGEST_BETA)
 
 
 class ExponentialBeta(Section):
