@@ -5,7 +5,9 @@ that it draws them from. An interval is a pair (low, high), both NaN where one s
 After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -46,14 +48,14 @@ def mean_interval(
         error = np.std(values, axis=0, ddof=1) / np.sqrt(seeds)
         half = scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2) * error
         return mean - half, mean + half
-    drawn = draws(seeds, repetitions, generator)
-    flat = values.reshape(seeds, -1)  # [seeds, points]
+    drawn = draws(seeds, repetitions, generator)  # the same resampled seeds serve every point
+    flat, place = np.unique(values.reshape(seeds, -1), axis=1, return_inverse=True)
     points = max(1, CHUNK // repetitions)
-    bounds = [  # the same resampled seeds serve every point
+    bounds = [
         percentiles(drawn @ flat[:, start : start + points] / seeds, confidence, seeds)
         for start in range(0, flat.shape[1], points)
     ]
-    low, high = np.concatenate(bounds, axis=1)
+    low, high = np.concatenate(bounds, axis=1)[:, place.ravel()]
     return low.reshape(mean.shape), high.reshape(mean.shape)
 
 
@@ -197,7 +199,7 @@ def logrank(
     else:  # which `permutation_test` would draw one by one
         tested = scipy.stats.monte_carlo_test(
             scores,
-            lambda size: generator.permuted(np.broadcast_to(scores, size), axis=-1),
+            lambda size: scores[orders(*size, generator)],
             lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
             n_resamples=repetitions,
             batch=BATCH,
@@ -225,7 +227,7 @@ def probability_of_improvement(
         drawn_x, drawn_y = (draws(len(runs), repetitions, generator) for runs in (x, y))
         means += wins.mean(axis=(0, 1)) / len(pairs)
         for metric in range(metrics):
-            won = np.sum((drawn_x @ wins[:, :, metric]) * drawn_y, axis=1)
+            won = np.einsum("ry,ry->r", drawn_x @ wins[:, :, metric], drawn_y)
             resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
     fewest = min(len(runs) for both in pairs for runs in both)
     low, high = percentiles(resampled, confidence, fewest)
@@ -244,6 +246,31 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     return np.minimum(adjusted, 1)
 
 
+def _remembered(
+    draw: Callable[[int, int, np.random.Generator], np.ndarray],
+) -> Callable[[int, int, np.random.Generator], np.ndarray]:
+    """`draw`, which most rows of a table call with equal generators, drawing only once for each.
+
+    The generator moves on as if it had been drawn from.
+    """
+
+    @lru_cache(maxsize=64)
+    def drawn(first: int, second: int, state: str) -> tuple[np.ndarray, str]:
+        generator = np.random.default_rng()
+        generator.bit_generator.state = json.loads(state)
+        values = draw(first, second, generator)
+        values.flags.writeable = False
+        return values, json.dumps(generator.bit_generator.state)
+
+    def again(first: int, second: int, generator: np.random.Generator) -> np.ndarray:
+        values, after = drawn(first, second, json.dumps(generator.bit_generator.state))
+        generator.bit_generator.state = json.loads(after)
+        return values
+
+    return again
+
+
+@_remembered
 def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.ndarray:
     """How often each of `count` values is in each bootstrap sample of that size.
 
@@ -253,6 +280,12 @@ def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.nd
     drawn += count * np.arange(repetitions)[:, None]  # each sample has a range of its own
     times = np.bincount(drawn.ravel(), minlength=repetitions * count)
     return times.reshape(repetitions, count).astype(np.float64)
+
+
+@_remembered
+def orders(repetitions: int, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Random orders of `count` values, int64 [repetitions, count]."""
+    return generator.permuted(np.tile(np.arange(count), (repetitions, 1)), axis=-1)
 
 
 def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
