@@ -16,6 +16,6 @@ rule claims:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
         command=COMMAND,
-        code=code("evaluate.py", MEASURED),
+        code=code("claims.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/claims.py"

@@ -31,16 +31,14 @@ rule page:
     params:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
-        labels=study.labels,
-        colours=study.colours,
+        style=STYLE | {"layout": {"columns": 3}},
         command=COMMAND,
-        layout={"columns": 3},
         configuration={
             file: Path(file).read_text(encoding="utf-8") for file in (*config_files, CLAIMS)
         },
         ppo=ppo_settings(),
         own=own_code(),
         template=provenance.file_digest(PACKAGE / "study" / "show" / "report.html"),
-        code=code("evaluate.py", MEASURED),
+        code=code("page.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/page.py"

@@ -69,6 +69,7 @@ COMMAND = ["snakemake", "all"]
 COMMAND += ["--configfile", *config_files[1:]] if config_files[1:] else []
 COMMAND += ["--config", *GIVEN] if GIVEN else []
 COMMAND = shlex.join(COMMAND)
+STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours": study.colours}
 TRAININGS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # with how many episodes
 
 

@@ -14,9 +14,9 @@ rule metrics:
     params:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
-        code=code("evaluate.py", MEASURED),
+        code=code("metrics.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/metrics.py"
 
 
 SUPPLEMENT = {
@@ -41,9 +41,9 @@ rule tables:
         runs=TRAININGS,
         settings=MEASURED.model_dump(),
         labels=study.labels,
-        code=code("evaluate.py", MEASURED),
+        code=code("tables.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/tables.py"
 
 
 rule table2:
@@ -55,9 +55,9 @@ rule table2:
         f"{RESULTS}/logs/table2.log",
     params:
         ppo=ppo_settings(),
-        code=code("evaluate.py"),
+        code=code("table2.py"),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/table2.py"
 
 
 TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
@@ -81,6 +81,6 @@ rule tables_page:
         settings=MEASURED.model_dump(),
         pictures=["figure1", "figure2", *PICTURES, *READ],
         command=COMMAND,
-        code=code("evaluate.py", MEASURED),
+        code=code("tables_page.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/tables_page.py"
