@@ -13,8 +13,7 @@ rule claims:
     log:
         f"{RESULTS}/logs/claims.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         command=COMMAND,
         code=code("claims.py", MEASURED),
     script:

@@ -48,8 +48,7 @@ rule picture:
     wildcard_constraints:
         picture="every_seed|constants|solved|forest",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         style=STYLE,
         code=code("picture.py", MEASURED),
     script:
@@ -71,8 +70,7 @@ rule readings:
     log:
         f"{RESULTS}/logs/readings.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         style=STYLE,
         code=code("readings.py", MEASURED),
     script:

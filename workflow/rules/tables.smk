@@ -12,8 +12,7 @@ rule metrics:
     log:
         f"{RESULTS}/logs/metrics.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         code=code("metrics.py", MEASURED),
     script:
         "../scripts/metrics.py"
@@ -38,8 +37,7 @@ rule tables:
     log:
         f"{RESULTS}/logs/tables.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         labels=study.labels,
         code=code("tables.py", MEASURED),
     script:
@@ -61,15 +59,13 @@ rule table2:
 
 
 TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
-TABULATED += (
-    ["readings"] if READ and HAS_PAPERS else []
-)  # seconds of work that only Table 1 is worth
+TABULATED += READ if HAS_PAPERS else []  # seconds of work that only Table 1 is worth
 
 
 # The pictures are no inputs: the page only names them.
 rule tables_page:
     input:
-        **{name: f"{RESULTS}/{name}.csv" for name in TABULATED},
+        **csv(*TABULATED),
         **LEDGER,
         claims=CLAIMS,
     output:
@@ -77,8 +73,7 @@ rule tables_page:
     log:
         f"{RESULTS}/logs/tables_page.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         pictures=["figure1", "figure2", *PICTURES, *READ],
         command=COMMAND,
         code=code("tables_page.py", MEASURED),

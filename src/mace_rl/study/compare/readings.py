@@ -128,9 +128,7 @@ def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str
     return names[reading]
 
 
-def in_order(
-    table: pd.DataFrame,
-) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
+def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
     """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
     found = [
         ((str(kind), str(reading), str(source)), rows)

@@ -66,10 +66,7 @@ def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, n
 
 
 def paired_comparison(
-    differences: np.ndarray,
-    confidence: float,
-    repetitions: int,
-    generator: np.random.Generator,
+    differences: np.ndarray, confidence: float, repetitions: int, generator: np.random.Generator
 ) -> PairedComparison:
     """Compare x with y, of which `differences` are x - y by seed, [seeds] or [seeds, metrics].
 
@@ -165,10 +162,7 @@ def stratified_comparison(
 
 
 def logrank(
-    x: np.ndarray,
-    y: np.ndarray,
-    repetitions: int,
-    generator: np.random.Generator,
+    x: np.ndarray, y: np.ndarray, repetitions: int, generator: np.random.Generator
 ) -> float:
     """Two-sided p value of the log-rank test that x [n] and y [m] come from the same distribution.
 
@@ -199,7 +193,7 @@ def logrank(
     else:  # which `permutation_test` would draw one by one
         tested = scipy.stats.monte_carlo_test(
             scores,
-            lambda size: scores[orders(*size, generator)],
+            lambda size: scores[orders(size[0], size[1], generator)],
             lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
             n_resamples=repetitions,
             batch=BATCH,

@@ -288,6 +288,16 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     return tuple(metrics)
 
 
+def metric_units(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.unit for metric in all_metrics(settings)}
+
+
+def metric_labels(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.label for metric in all_metrics(settings)}
+
+
 def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     """The columns of metrics.csv, one row per run, with these metrics."""
     run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from mace_rl.records import RecordError, RunKey
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.measure.metrics import all_metrics, moving_average
+from mace_rl.study.measure.metrics import metric_labels, moving_average
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 
 MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
@@ -63,8 +63,8 @@ def plot_style(
     colours: Mapping[str, str],
 ) -> PlotStyle:
     """The style of a study that is measured by these settings; `layout`: of a `FigureConfig`."""
-    metrics = {metric.name: metric.label for metric in all_metrics(settings)}
-    return PlotStyle(FigureConfig(**layout), settings.confidence, labels, colours, metrics)
+    names = metric_labels(settings)
+    return PlotStyle(FigureConfig(**layout), settings.confidence, labels, colours, names)
 
 
 def quantity(figure: str, settings: MetricsConfig) -> Quantity:
@@ -96,7 +96,10 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
         values = frame[shown.column].to_numpy()
         head = values[: shown.window - 1]
         average = np.concatenate(
-            [np.cumsum(head) / np.arange(1, len(head) + 1), moving_average(values, shown.window)]
+            [
+                np.cumsum(head) / np.arange(1, len(head) + 1),
+                moving_average(values, shown.window),
+            ]
         )
         stride = math.ceil(len(values) / MAX_POINTS)
         kept = np.arange(len(values) - 1, -1, -stride)[::-1]
@@ -130,10 +133,7 @@ def mean_curves(
 
 
 def draw_figure(
-    curves: pd.DataFrame,
-    single_seeds: pd.DataFrame,
-    shown: Quantity,
-    look: PlotStyle,
+    curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> Figure:
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 

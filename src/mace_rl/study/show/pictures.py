@@ -18,7 +18,7 @@ from mace_rl.study.compare.ledger import Answer, Finding
 from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.verdicts import CONFIDENCE, WORTH_MENTIONING
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import metric_labels
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
 from mace_rl.study.show.tables import SOLVED
@@ -194,8 +194,7 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     if any(other.environments != part.environments for other in parts):
         words += [name.partition("-")[0] for name in part.environments]
     if any(other.metric != part.metric for other in parts):
-        labels = {metric.name: metric.label for metric in all_metrics(source.settings)}
-        words.append(labels.get(part.metric, part.metric).lower())
+        words.append(metric_labels(source.settings).get(part.metric, part.metric).lower())
     if part.baseline:
         words.append(f"over {source.claims.variants.get(part.baseline, part.baseline)}")
     return ", ".join(words)
