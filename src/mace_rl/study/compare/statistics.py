@@ -94,13 +94,11 @@ def equivalence(
     """
     if min(map(len, differences)) == 1:
         return np.nan
-    above, below = (
-        _weighted([values - end for values in differences]) for end in (-margin, margin)
-    )
-    return max(
-        float(_sign_flips(above, repetitions, generator, "greater")),
-        float(_sign_flips(below, repetitions, generator, "less")),
-    )
+    p_values = []
+    for end, alternative in ((-margin, "greater"), (margin, "less")):
+        shifted = _weighted([values - end for values in differences])
+        p_values.append(float(_sign_flips(shifted, repetitions, generator, alternative)))
+    return max(p_values)
 
 
 def _sign_flips(
@@ -110,17 +108,9 @@ def _sign_flips(
     alternative: str = "two-sided",
 ) -> np.ndarray:
     """p value of the sign-flip test of each mean over the first axis, exact where it can be."""
-    tested = scipy.stats.permutation_test(
-        (values,),
-        np.mean,
-        permutation_type="samples",
-        alternative=alternative,
-        n_resamples=repetitions,
-        batch=BATCH,
-        rng=generator,
-        vectorized=True,
-    )
-    return tested.pvalue
+    how = {"permutation_type": "samples", "alternative": alternative, "vectorized": True}
+    how |= {"n_resamples": repetitions, "batch": BATCH, "rng": generator}
+    return scipy.stats.permutation_test((values,), np.mean, **how).pvalue
 
 
 def _weighted(differences: Sequence[np.ndarray]) -> np.ndarray:
@@ -182,23 +172,16 @@ def logrank(
     def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
         return np.round(np.mean(x, axis=axis) - np.mean(y, axis=axis), 12)  # ties
 
+    how = {"n_resamples": repetitions, "batch": BATCH, "vectorized": True}
     if scipy.special.comb(len(times), len(x)) <= repetitions:
-        tested = scipy.stats.permutation_test(
-            (scores[: len(x)], scores[len(x) :]),
-            statistic,
-            n_resamples=repetitions,
-            batch=BATCH,
-            vectorized=True,
-        )
-    else:  # which `permutation_test` would draw one by one
-        tested = scipy.stats.monte_carlo_test(
-            scores,
-            lambda size: scores[orders(size[0], size[1], generator)],
-            lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
-            n_resamples=repetitions,
-            batch=BATCH,
-            vectorized=True,
-        )
+        both = scores[: len(x)], scores[len(x) :]
+        return float(scipy.stats.permutation_test(both, statistic, **how).pvalue)
+    tested = scipy.stats.monte_carlo_test(  # `permutation_test` would draw orders one by one
+        scores,
+        lambda size: scores[orders(size[0], size[1], generator)],
+        lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
+        **how,
+    )
     return float(tested.pvalue)
 
 

@@ -90,14 +90,8 @@ def _animation(
 ) -> Animation:
     still = io.BytesIO()
     shown.pictures[-1].quantize(32).save(still, format="PNG", optimize=True)
-    return Animation(
-        title,
-        shown.returns[0],
-        data_uri("image/gif", data),
-        data_uri("image/png", still.getvalue()),
-        tuple(variants),
-        trained,
-    )
+    pictures = data_uri("image/gif", data), data_uri("image/png", still.getvalue())
+    return Animation(title, shown.returns[0], *pictures, tuple(variants), trained)
 
 
 def data_uri(kind: str, data: bytes) -> str:
