@@ -142,9 +142,12 @@ def draw_solved(table: pd.DataFrame, look: PlotStyle) -> Figure:
         share=table["solved"] / table["seeds"],
         text=table["solved"].astype(str) + "/" + table["seeds"].astype(str),
     )
-    wide = table.pivot(index="variant", columns="env", values=["share", "text"])
-    wide = wide.reindex(table["variant"].unique())
-    share, text = (wide[name][table["env"].unique()] for name in ("share", "text"))
+    share, text = (
+        table.pivot(index="variant", columns="env", values=name).loc[
+            table["variant"].unique(), table["env"].unique()
+        ]
+        for name in ("share", "text")
+    )
     with style():
         figure, (axes,) = grid(1, 1, height=0.24 * len(share) + 2 * LEGEND_HEIGHT)
         blues = seaborn.light_palette("#4a90c8", as_cmap=True)  # on which one colour can be read
