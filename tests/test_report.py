@@ -25,12 +25,11 @@ from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import ConstantsConfig
 from mace_rl.study.show.animations import animations
-from mace_rl.study.show.cells import number
 from mace_rl.study.show.curves import PlotStyle
 from mace_rl.study.show.report import Provenance, three_digits
 from mace_rl.study.show.report import page as build
 from mace_rl.study.show.sections import read_data
-from mace_rl.study.show.tables import costs
+from mace_rl.study.show.tables import costs, number
 from tools.tables import RULES
 
 ROOT = Path(__file__).parents[1]

@@ -272,8 +272,9 @@ def test_a_dying_predecessor_is_waited_for(tmp_path):
 JOB = """
 import sys
 sys.path.insert(0, sys.argv[1])
+from types import SimpleNamespace
 from job import job
-with job("it", "log"):
+with job(SimpleNamespace(rule="it", wildcards=[], log=["log"])):
     raise eval(sys.argv[2])
 """
 

@@ -35,12 +35,12 @@ from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
-from mace_rl.study.show.cells import Cell, Value, estimate, number
 from mace_rl.study.show.latex import escaped, latex_cell, table1_latex, table2_latex
 from mace_rl.study.show.markdown import markdown, plain
 from mace_rl.study.show.markdown import page as markdown_page
 from mace_rl.study.show.report import as_html
 from mace_rl.study.show.sections import of_ledger, of_runs, read_data
+from mace_rl.study.show.tables import Cell, Value, estimate, number
 
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
 metrics = partial(table_for_tables, all_metrics(SETTINGS))

@@ -169,7 +169,7 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN | {"table2": 1}),
     ("src/mace_rl/study/measure/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
     ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
-    ("workflow/scripts/evaluate.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
+    ("workflow/scripts/tables.py", "\n", "\n\n", TABLES),
     ("config/claims.yaml", "[140, 660]", "[141, 660]", PAPERS),
     (
         *("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"),

@@ -42,8 +42,8 @@ ROBUST = "robust"  # the way to measure that is compared
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
-    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "forest"),
-    *("readings", "page"),
+    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "readings"),
+    "page",
 )
 
 
