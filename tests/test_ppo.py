@@ -20,7 +20,6 @@ both_environments = pytest.mark.parametrize("environment", ENVIRONMENTS)
 
 
 def networks(ppo: PPO) -> dict[str, Twin]:
-    """Policy and critics in float64."""
     return {"actor": Twin(ppo.policy)} | {k: Twin(critic) for k, critic in ppo.critics.items()}
 
 
@@ -32,11 +31,9 @@ def random_batch(ppo: PPO, count=40) -> tuple[Batch, dict[str, np.ndarray]]:
     size = len(ppo.normaliser.mean)
     observations = rng.standard_normal((count, size)).astype(np.float32)
     outputs = policy.network.outputs(observations)
-    actions = (
-        rng.integers(outputs.shape[1], size=count)
-        if policy.discrete
-        else rng.standard_normal(outputs.shape).astype(np.float32)
-    )
+    actions = rng.standard_normal(outputs.shape).astype(np.float32)
+    if policy.discrete:
+        actions = rng.integers(outputs.shape[1], size=count)
     noise = 0.4 * rng.standard_normal(count)
     batch = Batch(
         observations=observations,
@@ -57,9 +54,6 @@ def surrogate(
     return torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean(), ratio
 
 
-# --- Gradients ----------------------------------------------------------------------------------
-
-
 @both_engines
 @both_environments
 def test_policy_gradients_equal_autograd(make_ppo, environment, engine):
@@ -73,9 +67,6 @@ def test_policy_gradients_equal_autograd(make_ppo, environment, engine):
         expected = twin.gradient((log_probs * torch.from_numpy(advantage)).mean())
         np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-5)
         assert gradient.dtype == np.float32
-
-
-# --- Updates ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("max_gradient_norm", [0.05, 1e9])
@@ -183,7 +174,6 @@ def test_an_update_of_both_learners_equals_a_reference_loop(make_ppo, environmen
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twenty_episodes_of_both_learners_agree(run_config, seed):
-    """Their curves are equal: no sampled action hangs on the last bits."""
     curves = [
         [record.extrinsic_return for record in finish(run_config(seed=seed, **settings)).records]
         for settings in ({"episodes": 20, "engine": one} for one in ENGINES)
