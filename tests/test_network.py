@@ -192,10 +192,9 @@ def test_modules_that_do_not_fit_are_refused_by_name(run_config, module, argumen
 def test_a_module_of_one_s_own_is_the_same_from_the_same_seed_and_disturbs_nothing(run_config):
     config = run_config(ppo={"network": LAYER_NORM}).ppo
     before = torch.get_rng_state()
-    one, same, other = (
-        TorchNetwork(custom_module(config.network, [16], 5, 3, np.random.default_rng(seed)))
-        for seed in (0, 0, 1)
-    )
+    generators = map(np.random.default_rng, (0, 0, 1))
+    modules = [custom_module(config.network, [16], 5, 3, generator) for generator in generators]
+    one, same, other = map(TorchNetwork, modules)
     assert (one.parameters == same.parameters).all() and (one.parameters != other.parameters).any()
     inputs = drawn(np.random.default_rng(2), (9, 5))
     expected = one.module()(torch.from_numpy(inputs)).detach()

@@ -3,18 +3,17 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
+from shared import ROOT
 
 from mace_rl.environments.tasks import BarrenRegion, DeepSea, NoisyDeepSea
 from mace_rl.study.config import Study, read_study
 
-ROOT = Path(__file__).parents[1]
 NORTH, EAST, SOUTH, WEST = range(4)
 
 # By state and action: probability, next state, reward, end; as Gymnasium's grids have it.
@@ -63,7 +62,6 @@ def test_gymnasium_accepts_them(study, recwarn):
 
 
 def test_random_returns_of_the_study(study):
-    """As the configuration has them, measured: against the exact expectations."""
     expected = {f"DeepSea{size}-v0": 2.0**-size - 0.005 for size in (10, 20)}
     for name in ("FrozenLake8x8Deterministic-v0", "CliffWalking200-v0"):
         env = gymnasium.make(name).unwrapped
@@ -95,9 +93,6 @@ def at_random(right: list[float], size: int) -> float:
         return p * (reward + there) + (1 - p if row else 1 / 3) * back
 
     return ahead(0, 0)
-
-
-# --- Gymnasium's --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("skilled", [False, True])
@@ -139,9 +134,6 @@ def test_the_television_of_the_noisy_mountain_car():
             over = any(ends)
     assert len(paid) == 10 and len(np.unique(shown)) == len(shown) > 500
     assert kstest(shown, "uniform", args=(-1, 2)).pvalue > 0.01
-
-
-# --- Deep sea -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [1, 5, 9])
@@ -199,11 +191,7 @@ def test_the_archive_of_the_late_deep_sea_is_beside_its_goal(late):
     check_env(env.unwrapped, skip_render_check=True)
 
 
-# --- Barren region ------------------------------------------------------------------------------
-
-
 def transitions(env: BarrenRegion) -> Table:
-    """Every action in every cell, tried."""
     env.reset(seed=0)
     table = {}
     for cell, action in itertools.product(range(len(env.kinds)), range(4)):
