@@ -20,15 +20,15 @@ import torch
 from gymnasium.spaces import Discrete
 from torch import Tensor, from_numpy, nn
 
+from mace_rl.agent.advantages import paid_returns
 from mace_rl.agent.learner import Update
 from mace_rl.agent.policy import Policy
 from mace_rl.agent.ppo import ActorCritic
-from mace_rl.agent.scale import discounted_sums
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.config.published import PublishedConfig
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 from mace_rl.environments.spaces import Spaces
@@ -207,7 +207,7 @@ class Meta(Stateful):
         self.printed = output.sigmoid().item()
 
 
-def networks(config: RunConfig, spaces: Spaces, streams: Streams) -> ActorCritic:
+def networks(config: AgentConfig, spaces: Spaces, streams: Streams) -> ActorCritic:
     """Policy and critic, as training begins with them."""
     assert config.published is not None
     settings, size, dropout = config.ppo, spaces.observation_size, config.published.dropout
@@ -303,8 +303,7 @@ class PublishedTrainer(Trainer):
                 self.controller.read(episode, weighed * self.settings.meta_sees_bonus)
                 printed = self.controller.printed
         self._record(episode, weighed, beta)
-        backwards = np.flip(episode.rewards + beta * weighed).copy()
-        returns = np.flip(discounted_sums(backwards, self.config.ppo.discount)).copy()
+        returns = paid_returns(episode.rewards + beta * weighed, self.config.ppo.discount)
         states, none = episode.observations, np.zeros(len(episode))
         unknown = np.nan  # how the two rewards share in what one critic learns
         given = episode, states, printed, bonus, returns, returns, none, none

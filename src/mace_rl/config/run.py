@@ -1,9 +1,7 @@
 """Everything that determines one training run, typed, frozen and checked once.
 
-The values and their sources (paper, the authors' public code, our choice) stand in `config.yaml`;
-this module, with `agent`, `bonus` and `beta` beside it, says what each one means and which values
-are possible. A `RunConfig` is all a run depends on besides the code: equal `RunConfig`s give equal
-results.
+`config.yaml` has the values and their sources. This module, with `agent`, `bonus` and `beta` beside
+it, says what each means and may be. Equal `RunConfig`s and equal code give equal results.
 """
 
 import json
@@ -21,15 +19,13 @@ from mace_rl.config.section import Arguments, Section, short_repr
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
-BONUS_SECTIONS = ("bonus", "memory", "novelty")  # what only variants with a bonus use
+BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 
 
-class RunConfig(Section):
-    """One training run: environment, variant, seed and every hyperparameter that it uses.
+class AgentConfig(Section):
+    """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
-    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
-    others, so that a change of what a variant does not use leaves its runs alone.
-    """
+    model_config = Section.model_config | {"extra": "ignore"}
 
     environment: str
     variant: str
@@ -40,11 +36,22 @@ class RunConfig(Section):
     trainer: Literal["published"] | None = None  # `mace_rl.published`; None: `mace_rl.trainer`
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
+    published: PublishedConfig | None = None
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+
+class RunConfig(AgentConfig):
+    """One training run: environment, variant, seed and every hyperparameter that it uses.
+
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    others, so that a change of what a variant does not use leaves its runs alone.
+    """
+
+    model_config = Section.model_config
+
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
-    published: PublishedConfig | None = None
     beta: BetaConfig = Field(discriminator="kind")
 
     @model_validator(mode="before")
@@ -59,13 +66,6 @@ class RunConfig(Section):
         return {key: value for key, value in values.items() if key not in unused}
 
     @model_validator(mode="after")
-    def _all_that_is_used(self) -> "RunConfig":
-        for section in {*BONUS_SECTIONS, "meta"} - set(unused_sections(self)):
-            if getattr(self, section) is None:
-                raise ValueError(f"the section {section!r} is missing")
-        return self
-
-    @model_validator(mode="after")
     def _what_its_trainer_computes(self) -> "RunConfig":
         for key, value in (COMPUTED if self.trainer else {"published": None}).items():
             if (found := attrgetter(key)(self)) != value:
@@ -78,12 +78,19 @@ class RunConfig(Section):
             raise ValueError("beta.kind is 'custom', which trainer: published does not know")
         return self
 
+    @model_validator(mode="after")
+    def _all_that_is_used(self) -> "RunConfig":
+        for section in {*BONUS_SECTIONS, "meta"} - set(unused_sections(self)):
+            if getattr(self, section) is None:
+                raise ValueError(f"the section {section!r} is missing")
+        return self
+
     def settings(self) -> dict[str, Any]:
-        """Plain values, as in `run.json`, without what is not used: equal ones, equal results."""
+        """Plain values, as in `run.json`, without unused sections."""
         return {name: value for name, value in self.model_dump().items() if value is not None}
 
     def references(self) -> dict[str, str]:
-        """By key, the code from outside this package that takes part, as package.module:Name."""
+        """By key, the code that the run names as package.module:Name."""
         found = {
             "environment": self.environment if ":" in self.environment else None,
             "ppo.network.module": getattr(self.ppo.network, "module", None),
@@ -95,10 +102,7 @@ class RunConfig(Section):
 
 
 def unused_sections(settings: Any) -> dict[str, str]:
-    """The sections that a run with these settings does not use, each with what in them says so.
-
-    settings: a `RunConfig`, or plain values before they are checked.
-    """
+    """The sections that a run with these settings, plain or checked, does not use, with reasons."""
 
     def value(*keys: str) -> Any:
         found = settings
