@@ -145,12 +145,12 @@ class Curiosity(Stateful):
             return 1 / (count + 1)
         if not self.fills:
             return 1.0
-        known = self.buffer[: self.entered]
+        known = self.buffer[: self.entered] - state
         self.buffer[self.entered % BUFFER_SIZE] = state
         self.entered += 1
         if not len(known):
             return 1.0
-        distances = np.sqrt(np.sort(np.square(known - state).sum(1)))
+        distances = np.sqrt(np.sort(np.square(known).sum(1)))
         means = [float(distances[:k].mean()) for k in NEIGHBOURS if k <= len(known)]
         return KNN_WEIGHT * sum(means) / len(NEIGHBOURS) + (1 - KNN_WEIGHT) / 2
 
@@ -285,13 +285,14 @@ class PublishedTrainer(Trainer):
     def _beta(self) -> float:
         """Of a schedule that is set after the first episode and each tenth on, or the first."""
         rule, done = self.config.beta, len(self.records)
-        if rule.kind == "constant":
-            return rule.value
+        if rule.kind == "meta":
+            reaches = self.settings.beta_reaches_reward and done
+            return self.controller.printed if reaches else rule.initial
         if rule.kind == "exponential":
             age = max(0, done - 1) // SCHEDULE_EVERY * SCHEDULE_EVERY
             return max(rule.floor, rule.initial * rule.decay**age)
-        reaches = self.settings.beta_reaches_reward and done
-        return self.controller.printed if reaches else rule.initial
+        assert rule.kind == "constant"
+        return rule.value
 
     def appraise(self, episode: Episode) -> Experience:
         """The returns of the total reward; what is returned has the β that the network printed."""
