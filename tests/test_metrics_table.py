@@ -80,7 +80,7 @@ def test_betas_are_measured_like_returns(tmp_path):
         expected = stagnation.corr(pd.Series(beta), method="spearman")
         assert correlation == pytest.approx(expected)
     result.to_csv(tmp_path / "betas.csv", index=False)
-    pd.testing.assert_frame_equal(read_table(tmp_path / "betas.csv", t.BETAS), result)
+    pd.testing.assert_frame_equal(read_table(tmp_path / "betas.csv", t.betas_columns(CONFIG)), result)
 
 
 def change(row, column, value):

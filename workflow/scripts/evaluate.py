@@ -136,13 +136,15 @@ def claims():
     """The ledger: what of the paper holds, and what of our own questions (docs/protocol.md)."""
     from mace_rl.study.compare.ledger import to_json
     from mace_rl.study.compare.verdicts import ledger
-    from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+    from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
     from mace_rl.study.show.markdown import page
     from mace_rl.study.show.sections import of_ledger
 
     paper = parse_claims(found.claims)
     table = read_metrics(found.metrics, params.runs, settings())
-    table = table.merge(read_table(found.betas, BETAS), how="left", validate="1:1")
+    table = table.merge(
+        read_table(found.betas, betas_columns(settings())), how="left", validate="1:1"
+    )
     answers = ledger(table, settings(), paper)
     hours = sum(read_record(Path(path))["seconds"] for path in found.records) / 3600
     cost = {"command": params.command, "runs": len(table), "core_hours": hours}

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -35,12 +35,29 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class SizedFinding(Finding):
+    """The same by the second rule, direction and size apart; `outcome` may be no_room, too."""
+
+    direction: str = ""  # shown, reversed or open
+    size: str = ""  # worth mentioning, small or open
+    room: float = math.nan  # how much better than the baseline a run could be at most
+    predicted_low: float = math.nan  # of where a mean of ours may lie if the paper's one run each
+    predicted_high: float = math.nan  # differs by chance
+    replication: str = ""  # agrees, within one seed's chance, disagrees; empty without a number
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a difference worth mentioning was possible."""
+        return self.room >= self.worth_mentioning
+
+
+@dataclass(frozen=True)
 class Judgement:
     """What came out of a claim, measured in one way."""
 
     outcome: str
     verdict: str  # the same in the words of its family
-    parts: list[Finding]
+    parts: Sequence[Finding]
 
 
 @dataclass(frozen=True)
@@ -84,4 +101,6 @@ def _judgement(outcome: str, verdict: str, parts: list[dict[str, Any]]) -> Judge
         part["environments"] = tuple(part["environments"])
         missing = [key for key, value in part.items() if value is None and key != "baseline"]
         part |= dict.fromkeys(missing, math.nan)
-    return Judgement(outcome, verdict, [Finding(**part) for part in parts])
+    kinds = [SizedFinding if "size" in part else Finding for part in parts]
+    found = [kind(**part) for kind, part in zip(kinds, parts, strict=True)]
+    return Judgement(outcome, verdict, found)

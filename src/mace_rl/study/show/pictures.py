@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.aggregate import SCORED
+from mace_rl.study.compare.estimates import CONFIDENCE, WORTH_MENTIONING
 from mace_rl.study.compare.ledger import Answer, Finding
 from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.compare.verdicts import CONFIDENCE, WORTH_MENTIONING
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style

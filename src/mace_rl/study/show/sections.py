@@ -12,10 +12,10 @@ import pandas as pd
 from mace_rl.records import read_table
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.comparisons import ALL
+from mace_rl.study.compare.estimates import POWER
 from mace_rl.study.compare.ledger import Answer, read_ledger
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.compare.verdicts import POWER
-from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
 
@@ -51,7 +51,7 @@ def read_data(
     data = {name: pd.read_csv(path, **how) for name, path in files.items()}
     data["metrics"] = read_metrics(found["metrics"], runs, settings)
     if "betas" in found:
-        data["betas"] = read_table(found["betas"], BETAS)
+        data["betas"] = read_table(found["betas"], betas_columns(settings))
     return data, read_ledger(found["ledger"]) if "ledger" in found else []
 
 
