@@ -38,7 +38,6 @@ class Finding:
 class SizedFinding(Finding):
     """The same by the second rule, direction and size apart; `outcome` may be no_room, too."""
 
-    direction: str = ""  # shown, reversed or open
     size: str = ""  # worth mentioning, small or open
     room: float = math.nan  # how much better than the baseline a run could be at most
     predicted_low: float = math.nan  # of where a mean of ours may lie if the paper's one run each
@@ -47,7 +46,7 @@ class SizedFinding(Finding):
 
     @property
     def has_room(self) -> bool:
-        """Whether a difference worth mentioning was possible."""
+        """Whether there could be a difference worth mentioning."""
         return self.room >= self.worth_mentioning
 
 

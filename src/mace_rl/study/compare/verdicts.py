@@ -7,7 +7,7 @@ the verdict on the claim. A file may ask for the second rule instead: `direction
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,14 +25,6 @@ from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import holm
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
-
-
-class Rule(NamedTuple):
-    """A rule, for parts of one kind of finding."""
-
-    find: Callable[[Part, pd.DataFrame, MetricsConfig], Any]  # before p values are corrected
-    decide: Callable[[Any], Any]  # afterwards: with its outcome
-    verdict: Callable[[Sequence[Any]], str]  # on a claim, from its parts
 
 
 def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -> list[Answer]:
@@ -66,11 +58,14 @@ def _answers(
             name: [part for several in claim.parts[how] for part in several.each(table1)]
             for name, claim in family.claims.items()
         }
-        every, rule = list(chain.from_iterable(parts.values())), RULES[claims.rule]
-        findings = iter(judge(rule, every, table, settings))
+        every = list(chain.from_iterable(parts.values()))
+        findings = iter(judge(every, table, settings, claims.rule))
         for name, own in parts.items():
             found = [next(findings) for _ in own]
-            answer = rule.verdict(found)
+            outcomes = [finding.outcome for finding in found]
+            answer = verdict(outcomes)
+            if answer == "open" and "no_room" in outcomes and not any(p.has_room for p in found):
+                answer = "no_room"
             judged[name][how] = Judgement(answer, words[answer], found)
     for name, claim in family.claims.items():
         paper = _in_paper(claim, table1, settings)
@@ -78,18 +73,20 @@ def _answers(
 
 
 def judge(
-    rule: Rule, parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig
+    parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig, rule: int
 ) -> list[Any]:
-    """What each part came out as, their p values corrected together.
+    """What each part came out as by a rule, their p values corrected together.
 
-    Those for a difference and those against one are corrected apart.
+    Those for a difference and those against one are corrected apart. A part that one seed leaves
+    without a p value counts as one of 1.
     """
-    found = [rule.find(part, table, settings) for part in parts]
-    different = _corrected([part.p_value for part in found])
-    equivalent = _corrected([part.p_equivalent for part in found])
+    find_by_rule, decided = RULES[rule]
+    findings = [find_by_rule(part, table, settings) for part in parts]
+    different = _corrected([finding.p_value for finding in findings])
+    equivalent = _corrected([finding.p_equivalent for finding in findings])
     return [
-        rule.decide(replace(part, p_holm=p, p_equivalent_holm=q))
-        for part, p, q in zip(found, different, equivalent, strict=True)
+        decided(replace(finding, p_holm=p, p_equivalent_holm=q))
+        for finding, p, q in zip(findings, different, equivalent, strict=True)
     ]
 
 
@@ -115,24 +112,21 @@ def outcome(finding: Finding) -> str:
 
 
 def _corrected(p_values: Sequence[float]) -> list[float]:
-    """Holm's p values; NaN where there was none, which counts as one of 1."""
+    """Holm's p values; NaN where there was none."""
     adjusted = holm([1.0 if np.isnan(p) else p for p in p_values])
     return [p if np.isnan(p) else float(q) for p, q in zip(p_values, adjusted, strict=True)]
 
 
 def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
-    """What is found of one part, with the margin of the protocol."""
+    """Estimates and tests of one part, with the protocol's margin."""
     pairs = pairs_of(part, table, settings)
     return find(part, pairs, WORTH_MENTIONING * pairs[0].everything, settings)
 
 
-RULES = {
-    1: Rule(
-        _find,
-        lambda part: replace(part, outcome=outcome(part)),
-        lambda parts: verdict([part.outcome for part in parts]),
-    ),
-    2: Rule(direction_and_size.find_sized, direction_and_size.decided, direction_and_size.verdict),
+# What a rule finds of a part, and what it makes of that when all p values are corrected.
+RULES: dict[int, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    1: (_find, lambda finding: replace(finding, outcome=outcome(finding))),
+    2: (direction_and_size.find_sized, direction_and_size.decided),
 }
 
 

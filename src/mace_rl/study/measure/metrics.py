@@ -8,7 +8,7 @@ censored, never dropped; E is then a lower bound.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -79,14 +79,6 @@ class LearningCurve:
         return Attained(episode + int(np.argmax(reached)), False)
 
 
-def _from_windows(count: int) -> Callable[[MetricsConfig, int], int]:
-    """The first episode after which there are so many windows of the moving average."""
-    return lambda settings, episodes: max(1, count * settings.moving_average)
-
-
-AT_ONCE = _from_windows(0)
-
-
 @dataclass(frozen=True)
 class Metric:
     """One thing measured on each run."""
@@ -96,8 +88,8 @@ class Metric:
     unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
     function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
     needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
-    # The first episode that it can be, of so many.
-    earliest: Callable[[MetricsConfig, int], int] = AT_ONCE
+    # Of the moving average's window and E, the first episode that it can be.
+    earliest: Callable[[int, int], int] = field(default=lambda window, _: 1, kw_only=True)
 
     @property
     def flag(self) -> str:
@@ -244,7 +236,7 @@ def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
     first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learned.
     """
-    first = _public_code_first(curve.settings, len(curve.returns))
+    first = _public_code_first(PUBLIC_CODE_WINDOW, len(curve.returns))
     flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[first - 1 :]) < PUBLIC_CODE_SLOPE
     return curve.first(flat, first)
 
@@ -291,15 +283,15 @@ def solved(curve: LearningCurve) -> float:
     return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
 
 
-def _public_code_first(settings: MetricsConfig, episodes: int) -> int:
+def _public_code_first(window: int, episodes: int) -> int:
     return int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1
 
 
 def _episodes(
     function: Callable[[LearningCurve], Attained], label: str, windows: int, *needs: str
 ) -> Metric:
-    metric = Metric(function.__name__, label, "episodes", function, *needs)
-    return replace(metric, earliest=_from_windows(windows))
+    name, earliest = function.__name__, lambda window, _: max(1, windows * window)
+    return Metric(name, label, "episodes", function, *needs, earliest=earliest)
 
 
 METRICS = (  # the area is under the learning curve, per episode

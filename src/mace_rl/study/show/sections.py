@@ -28,6 +28,10 @@ PARTS = (
     f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
     " correction."
 )
+BY_SIZE = (  # what parts have by the second rule
+    " *Room*: how much better than the second any run could be, or is. *One seed*: where our"
+    " difference would lie if the paper's, of one run each, is by chance what it is."
+)
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
 
@@ -64,19 +68,25 @@ def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
 def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
     """How many claims of one family have which verdict, in words."""
     counts = Counter(answer.ways[how].verdict for answer in answers)
-    words = claims.families[answers[0].family].words.model_dump().values()
+    words = claims.families[answers[0].family].words.model_dump(exclude_none=True).values()
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
+
+
+def parts_note(claims: ClaimsConfig) -> str:
+    """What the columns of parts are."""
+    return PARTS + BY_SIZE if claims.rule == 2 else PARTS
 
 
 def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
     """Family by family the verdicts, and then the parts in each way to measure them."""
     for title, own in by_family(answers).items():
         verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
-        note = f"Of {len(own)}, {verdicts}. The rule: docs/protocol.md."
+        page = "metrics" if claims.rule == 2 else "protocol"
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/{page}.md."
         yield Section(title.capitalize(), note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
-            yield Section(f"Part by part: {how}", PARTS, frame, level=3)
+            yield Section(f"Part by part: {how}", parts_note(claims), frame, level=3)
 
 
 def of_runs(

@@ -14,7 +14,7 @@ import pandas as pd
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.runs.progress import duration
 from mace_rl.study.claims_config import Table1Config, Table2Config
-from mace_rl.study.compare.ledger import Answer
+from mace_rl.study.compare.ledger import Answer, SizedFinding
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
@@ -24,6 +24,7 @@ from mace_rl.study.show.cells import Cell, Value, estimate, number
 
 CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
+BY_SIZE = ["room", "one seed", "replication", "size"]  # of parts, by the second rule
 SOLVED = 0.9  # of the last episodes, for a seed to count
 
 
@@ -229,11 +230,21 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
                 _estimate(vars(part), "probability", 2),
                 *(_number(part.in_paper, digits), _number(part.worth_mentioning, digits)),
                 _number(part.detectable, digits),
-                part.outcome,
+                *(_by_size(part, digits) if isinstance(part, SizedFinding) else [part.outcome]),
             ]
         )
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
-    return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
+    heads += ["margin", "detectable"]
+    more = [*BY_SIZE, ""] if rows and len(rows[0]) > len(heads) + 1 else [""]
+    return pd.DataFrame(rows, columns=[*heads, *more])
+
+
+def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
+    """What the second rule says of a part."""
+    ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
+    chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
+    outcome = part.outcome.replace("_", " ")
+    return [_number(part.room, digits), chance, part.replication, part.size, outcome]
 
 
 def costs(
