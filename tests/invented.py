@@ -40,6 +40,9 @@ PAPERS, QUESTIONS = (
     for title, family in CLAIMS.families.items()
 )
 LITERAL, ROBUST = CLAIMS.ways
+by_rule = PAPERS.model_dump() | {"rule": 2}
+by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be asked"
+BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}

@@ -180,3 +180,45 @@ def test_stagnation_goes_with_the_beta_of_the_next_episode():
     assert found[0] == pytest.approx(1) and max(found[1:]) < 0.9
     assert m.stagnation_correlation(returns, 0.4 - 0.1 * stagnation, window) == pytest.approx(-1)
     assert m.stagnation_correlation(returns, np.full(300, 0.4), window) == 0
+
+
+def by_hand(returns, betas, window, episodes):
+    """Stagnation after each of these episodes, over halves of what there is, with the next β."""
+    pairs = []
+    for t in episodes:
+        h = min(window, t // 2)
+        last, before = returns[t - h : t], returns[t - 2 * h : t - h]
+        pairs.append([round((np.mean(before) - np.mean(last)) / h, 9), betas[t]])
+    return pd.DataFrame(pairs).corr(method="spearman").iloc[0, 1] if pairs else 0
+
+
+@pytest.mark.parametrize("window", [10, 25])
+def test_stagnation_before_and_after_the_bar_from_the_first_windows_on(window):
+    returns = noisy(3)
+    betas = np.repeat(np.random.default_rng(1).random(100), 4)  # in steps
+
+    def found(betas, goal=100.0):
+        run = curve(returns[: len(betas)], random=0, goals=(goal,), moving_average=window)
+        return m.stagnation_correlations(run, betas)
+
+    reached = min(t for t, mean in averages(returns, window).items() if mean >= 75)
+    first = 2 * ((window + 9) // 10)
+    assert first + 20 < reached < 380
+    before = by_hand(returns, betas, window, range(first, reached))
+    after = by_hand(returns, betas, window, range(reached, 400))
+    assert found(betas) == pytest.approx((before, after)) and abs(before - after) > 0.01
+    # A bar never reached, one reached at the end, β that is constant before it, a short run.
+    whole = by_hand(returns, betas, window, range(first, 400))
+    assert found(betas, goal=1000.0) == pytest.approx((whole, 0))
+    assert found(betas[:reached]) == pytest.approx((before, 0))
+    assert found(np.where(np.arange(400) < reached, 0.4, betas)) == pytest.approx((0, after))
+    assert found(betas[:1]) == found(betas[:first]) == (0, 0)
+
+
+@pytest.mark.parametrize("metric", [one for one in m.METRICS if one.unit == "episodes"])
+def test_no_run_is_earlier_than_a_metric_can_be(metric):
+    """And one that is good from the beginning is as early, or once it has risen at all."""
+    at_once, risen = np.full(400, 500.0), np.array([-1e4, *[500.0] * 399])
+    curves = [noisy(seed) for seed in range(20)] + [at_once, risen]
+    found = [metric.function(curve(own, random=-1e4, goals=(500.0,))).number for own in curves]
+    assert 0 <= min(found) - metric.earliest(50, 400) <= 1

@@ -79,8 +79,12 @@ def test_betas_are_measured_like_returns(tmp_path):
         stagnation = (average.shift(50) - average).shift(1).round(9)  # ties
         expected = stagnation.corr(pd.Series(beta), method="spearman")
         assert correlation == pytest.approx(expected)
+    without = t.betas_table(found, CONFIG.model_copy(update={"reference_return": {}}))
+    pd.testing.assert_frame_equal(without, result.iloc[:, :-2])  # no bar, nothing before it
     result.to_csv(tmp_path / "betas.csv", index=False)
-    pd.testing.assert_frame_equal(read_table(tmp_path / "betas.csv", t.betas_columns(CONFIG)), result)
+    pd.testing.assert_frame_equal(
+        read_table(tmp_path / "betas.csv", t.betas_columns(CONFIG)), result
+    )
 
 
 def change(row, column, value):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from invented import CLAIMS, SEEDS, table_for_claims, table_for_questions, table_for_scores
+from invented import BY_SIZE, CLAIMS, SEEDS, table_for_claims, table_for_questions, table_for_scores
 
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.statistics import mean_interval
@@ -35,10 +35,11 @@ def runs() -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def ledgers() -> list[list[Answer]]:
-    """Of the paper's claims, and of our questions."""
+    """Of the paper's claims, of our questions, and of the claims by the second rule."""
     advantage = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
-    tables = table_for_claims(12, advantage, 0.05), table_for_questions(12)
-    return [ledger(table, QUESTIONED, CLAIMS) for table in tables]
+    claimed, asked = table_for_claims(12, advantage, 0.05), table_for_questions(12)
+    own = (claimed, CLAIMS), (asked, CLAIMS), (claimed, BY_SIZE)
+    return [ledger(table, QUESTIONED, claims) for table, claims in own]
 
 
 @pytest.fixture
@@ -89,11 +90,12 @@ def test_a_seed_solves_its_task_if_nine_of_ten_last_episodes_do(runs, settings) 
         assert (row.solved, row.seeds) == (sum(share >= 0.9 for share in own), len(own))
 
 
-@pytest.mark.parametrize("family", [0, 1])
+@pytest.mark.parametrize("family", [0, 1, 2])
 def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, settings) -> None:
     ledger = ledgers[family]
     table = PICTURES["forest"].data(Source({}, ledger, settings, CLAIMS))
     assert set(table["measured"]) == set(ledger[0].ways)
+    assert ("size" in table) == (family == 2)
     for how, rows in table.groupby("measured"):
         parts = [(one.ways[how], part) for one in ledger for part in one.ways[how].parts]
         for (judged, part), (_, row) in zip(parts, rows.iterrows(), strict=True):
@@ -106,14 +108,18 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
 
 
 @pytest.mark.parametrize(
-    "name", ["every_seed", "constants", "solved", "forest", "forest of questions"]
+    "name", ["every_seed", "constants", "solved", "forest", "forest of questions", "forest by size"]
 )
 def test_every_picture_can_be_drawn_and_is_the_same_again(
     runs, ledgers, settings, study, tmp_path, name
 ):
-    sources = {"forest": ledgers[0], "forest of questions": ledgers[1]}
+    sources = {
+        "forest": ledgers[0],
+        "forest of questions": ledgers[1],
+        "forest by size": ledgers[2],
+    }
     source = Source({"metrics": runs}, sources.get(name, []), settings, CLAIMS)
-    name = name.removesuffix(" of questions")
+    name = name.partition(" ")[0]
     names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}
     look = PlotStyle(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"), METRICS)
     table = PICTURES[name].data(source)

@@ -2,18 +2,15 @@
 
     python -m tools.rule_simulation [STUDIES]
 
-First, of 10 · STUDIES parts whose true difference is the margin, how many in % are called absent:
-by the test of equivalence alone, with the interval inside the margin too, and with the p value that
-Holm gives the first of 24 parts. Then STUDIES (100) studies are drawn from the runs that
-reference/tables/study has: how many in % give each of the paper's claims which verdict.
+Of 10 · STUDIES parts whose difference is the margin, how many in % are absent, by more and more of
+the rule; then, of STUDIES (100) drawn from the runs of reference/tables/study, what they say, in %.
 """
 
-import argparse
 import os
 import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product, repeat
 from pathlib import Path
 
@@ -22,36 +19,34 @@ import pandas as pd
 
 from mace_rl.config.reading import read_yaml
 from mace_rl.study.claims_config import ClaimsConfig, Part, parts_of
-from mace_rl.study.compare import direction_and_size
+from mace_rl.study.compare.direction_and_size import decided
 from mace_rl.study.compare.estimates import LEVEL, Pair, find, pairs_of
 from mace_rl.study.compare.ledger import SizedFinding
 from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import BEFORE, CORRELATION, CORRELATIONS, all_metrics
+from mace_rl.study.measure.metrics import BEFORE, CORRELATION, CORRELATIONS, METRICS
 
 SETTINGS = read_study([Path("config.yaml"), Path("config/study.yaml")]).metrics
 SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 1000})  # for the time
-EPISODES = {one.name: one for one in all_metrics(SETTINGS) if one.unit == "episodes"}
-TABLES, WAY, SEEDS, PARTS, MARGIN = Path("reference/tables/study"), "robust", (20, 40), 24, 3.0
+EPISODES = {one.name: one for one in METRICS if one.unit == "episodes"}
+TABLES, WAY, SEEDS, MARGIN = Path("reference/tables/study"), "robust", (20, 40), 3.0
 SPREADS = {"normal": 0, "one seed in 20 fails by 8 σ": 8, "one seed in 20 fails by 40 σ": 40}
 BEST, TABLE1, NOTHING = "as good as can be", "Table 1", "nothing differs"
 SAID = {"shown": "r", "reversed": "c", "absent": "n", "open": "i", "no_room": "x"}
 
 
-def absences(spread: str, seeds: int, count: int) -> np.ndarray:
-    """The first table's numbers, at that end of the margin where they are greater."""
+def absences(spread: str, seeds: int, count: int, end: int) -> np.ndarray:
+    """The first table's numbers, at this end of the margin."""
     draws, part = np.random.default_rng(0), Part(("A-v0",), "final_return", "a", None, np.nan)
-    found = np.zeros((2, 3))
-    for end, _ in product((0, 1), range(count)):
+    found = np.zeros(3)
+    for _ in range(count):
         failed = SPREADS[spread] * ((draws.random(seeds) < 1 / 20) - 1 / 20)
-        values = MARGIN * (-1) ** end + draws.normal(size=seeds) - failed
+        values = end * MARGIN + draws.normal(size=seeds) - failed
         one = find(part, [Pair(values, np.zeros(seeds), 1, np.inf, 0)], MARGIN, SETTINGS)
-        found[end, 0] += one.p_equivalent < LEVEL
-        for column, times in ((1, 1), (2, PARTS)):
-            known = asdict(one) | {"p_equivalent_holm": times * one.p_equivalent}
-            judged = direction_and_size.decided(SizedFinding(**known, room=np.inf))
-            found[end, column] += judged.outcome == "absent"
-    return 100 * found.max(axis=0) / count
+        sized, p = SizedFinding(**asdict(one), room=np.inf), one.p_equivalent
+        judged = [decided(replace(sized, p_equivalent_holm=p * parts)) for parts in (1, 24)]
+        found += [p < LEVEL, *(part.outcome == "absent" for part in judged)]
+    return 100 * found / count
 
 
 def claims_by(rule: int) -> ClaimsConfig:
@@ -67,37 +62,34 @@ def claims_by(rule: int) -> ClaimsConfig:
 
 
 CLAIMS = {rule: claims_by(rule) for rule in (1, 2)}
-[FAMILY] = CLAIMS[1].families.values()
 EVERY = [part for claims in CLAIMS.values() for _, part in parts_of(*claims.families.values())]
-PAIRS = {  # what is measured in which environment, and of which variant it is said to be better
-    (env, part.metric, part.variant) for part in EVERY for env in part.environments
-}
+CELLS = {(env, one.metric, one.variant) for one in EVERY for env in one.environments}
 RUNS = pd.read_csv(TABLES / "metrics.csv").merge(pd.read_csv(TABLES / "betas.csv"))
-RUNS = RUNS[["env", "variant", "episodes", *{metric for _, metric, _ in PAIRS}]]
+RUNS = RUNS[["env", "variant", "episodes", *sorted({metric for _, metric, _ in CELLS})]]
 
 
 def study(truth: str, seeds: int, draws: np.random.Generator) -> pd.DataFrame:
     """The metrics of a study in which that is true, of runs drawn with replacement."""
-    drawn, paper = [], CLAIMS[1].table1
-    for (env, variant), own in RUNS.groupby(["env", "variant"], sort=False):
+    drawn = []
+    for cell, own in RUNS.groupby(["env", "variant"], sort=False):
+        (env, variant), budget = map(str, cell), own["episodes"].min()
         pool = RUNS[RUNS["env"] == env] if truth == NOTHING else own
         new = pool.sample(seeds, replace=True, random_state=draws)
         new = new.assign(variant=variant, seed=range(seeds))
         for metric in new.columns.intersection([*CORRELATIONS, *EPISODES]):
-            value = paper.values_of([env], metric).get(variant)
+            value = CLAIMS[1].table1.values_of([env], metric).get(variant)
             if truth == NOTHING and metric in CORRELATIONS:
                 chosen = own[metric].sample(seeds, replace=True, random_state=draws)
                 new[metric] = (chosen - own[metric].mean()).to_numpy()
             elif truth == TABLE1 and value is not None:
-                budget = new["episodes"].iloc[0]
                 first = EPISODES[metric].earliest(SETTINGS.moving_average, budget)
                 new[metric] = (new[metric] - own[metric].mean() + value).clip(first, budget)
         drawn.append(new)
     table = pd.concat(drawn, ignore_index=True)
-    for env, metric, variant in PAIRS if truth == BEST else ():
+    for env, metric, variant in CELLS if truth == BEST else ():
         best = pairs_of(Part((env,), metric, variant, None, 0.0), table, SETTINGS)[0].best
-        own = (table["env"] == env) & (table["variant"] == variant)
-        table.loc[own, metric] = -best if metric in EPISODES else best
+        better = (table["env"] == env) & (table["variant"] == variant)
+        table.loc[better, metric] = -best if metric in EPISODES else best
     return table
 
 
@@ -109,31 +101,21 @@ def outcomes(truth: str, seeds: int, number: int) -> list[list[str]]:
 
 
 def main(studies: int) -> None:
-    """Print both tables."""
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         print("differences | seeds | test alone | and the interval | and Holm")
-        cells = list(product(SPREADS, SEEDS))
-        rows = [pool.submit(absences, *cell, 10 * studies) for cell in cells]
-        for cell, row in zip(cells, rows, strict=True):
-            print(*cell, *np.round(row.result(), 1), sep=" | ")
-        print("\ntrue | seeds | rule", *FAMILY.claims, sep=" | ")
+        for cell in product(SPREADS, SEEDS):
+            shares = pool.map(absences, *map(repeat, cell), [10 * studies] * 2, (-1, 1))
+            print(*cell, *np.round(np.max(list(shares), axis=0), 1), sep=" | ", flush=True)
+        print("\ntrue | seeds | rule", *(f"C{number}" for number in range(1, 11)), sep=" | ")
         for truth, seeds in product((BEST, TABLE1, NOTHING), SEEDS):
-            whole = pool.map(outcomes, repeat(truth), repeat(seeds), range(studies), chunksize=5)
-            by_rule = np.array(list(whole)).transpose(1, 2, 0)
-            for rule, claims in zip(CLAIMS, by_rule, strict=True):
-                said = [
-                    " ".join(f"{SAID[k]} {100 * n / studies:.0f}" for k, n in own.most_common())
-                    for own in map(Counter, claims.tolist())
-                ]
+            found = np.array(list(pool.map(outcomes, repeat(truth), repeat(seeds), range(studies))))
+            for rule, claims in zip(CLAIMS, found.transpose(1, 2, 0).tolist(), strict=True):
+                counts = [Counter(SAID[one] for one in own).most_common() for own in claims]
+                said = [", ".join(f"{k} {100 * n / studies:.0f}" for k, n in own) for own in counts]
                 print(truth, seeds, rule, *said, sep=" | ", flush=True)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="example: python -m tools.rule_simulation 50"
-    )
-    parser.add_argument("studies", type=int, nargs="?", default=100, help="(default: 100)")
-    count = parser.parse_args().studies
-    if count < 1:
-        sys.exit(f"rule_simulation: STUDIES is {count}, but should be at least 1")
-    main(count)
+    if not (given := " ".join(sys.argv[1:]) or "100").isdecimal() or not int(given):
+        sys.exit(f"rule_simulation: {given!r} should be one number of studies, at least 1")
+    main(int(given))

@@ -142,9 +142,8 @@ def claims():
 
     paper = parse_claims(found.claims)
     table = read_metrics(found.metrics, params.runs, settings())
-    table = table.merge(
-        read_table(found.betas, betas_columns(settings())), how="left", validate="1:1"
-    )
+    betas = read_table(found.betas, betas_columns(settings()))
+    table = table.merge(betas, how="left", validate="1:1")
     answers = ledger(table, settings(), paper)
     hours = sum(read_record(Path(path))["seconds"] for path in found.records) / 3600
     cost = {"command": params.command, "runs": len(table), "core_hours": hours}

@@ -158,8 +158,7 @@ class ClaimsConfig(Section):
 
         Parts of returns have their margin by `metrics.reference_return` of their environments.
         """
-        measured = [one.name for one in all_metrics(settings)]
-        has = {*environments, *variants, *measured, *CORRELATIONS}
+        has = {*environments, *variants, *CORRELATIONS}.union(m.name for m in all_metrics(settings))
         found = {}
         for title, family in self.families.items():
             parts = [part for _, part in parts_of(family)]

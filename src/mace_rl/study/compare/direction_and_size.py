@@ -1,7 +1,6 @@
 """The second rule of verdicts: direction and size apart (docs/metrics.md, "The second rule").
 
-Of each part it says whether there is a difference, whether it is worth mentioning, how it goes with
-the paper's own, and whether there was room for one.
+Is there a difference, is it worth mentioning, does the paper's agree, and was there room for one?
 """
 
 from dataclasses import asdict, replace
@@ -11,15 +10,8 @@ import pandas as pd
 import scipy
 
 from mace_rl.study.claims_config import Part
-from mace_rl.study.compare.estimates import (
-    CONFIDENCE,
-    FEWEST_SEEDS,
-    LEVEL,
-    WORTH_MENTIONING,
-    Pair,
-    find,
-    pairs_of,
-)
+from mace_rl.study.compare import estimates
+from mace_rl.study.compare.estimates import LEVEL, Pair, find, pairs_of
 from mace_rl.study.compare.ledger import SizedFinding
 from mace_rl.study.metrics_config import MetricsConfig
 
@@ -41,13 +33,12 @@ def find_sized(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Size
 
 def decided(part: SizedFinding) -> SizedFinding:
     """A part whose p values are corrected, with what the rule says of it."""
-    if part.seeds < FEWEST_SEEDS:
+    if part.seeds < estimates.FEWEST_SEEDS:
         return replace(part, outcome="open", size="open")
-    size, outcome = "open", "open"
+    size = "small" if max(-part.low, part.high) < part.worth_mentioning else "open"
     if max(part.low, -part.high) > part.worth_mentioning:
         size = "worth mentioning"
-    elif max(-part.low, part.high) < part.worth_mentioning:
-        size = "small"
+    outcome = "open"
     if part.p_holm < LEVEL:
         outcome = "shown" if part.difference > 0 else "reversed"
     elif not part.has_room:
@@ -60,14 +51,13 @@ def decided(part: SizedFinding) -> SizedFinding:
 def by_chance(differences: np.ndarray) -> float:
     """How far our mean may lie from the difference of one run each, if only chance parts them.
 
-    Half a prediction interval (Spence and Stanley 2016; Patil, Peng and Leek 2016): with our
-    variance σ² of differences [n] that of one run each is σ², our mean's σ² / n, and that of how
-    far they lie apart σ² (1 + 1 / n). NaN with one seed.
+    Half a prediction interval (Spence and Stanley 2016; Patil, Peng and Leek 2016): a difference of
+    one run each varies by our σ², the mean of our n by σ² / n. NaN with one seed.
     """
     seeds = len(differences)
     if seeds == 1:
         return np.nan
-    quantile = scipy.special.stdtrit(seeds - 1, (1 + CONFIDENCE) / 2)
+    quantile = scipy.special.stdtrit(seeds - 1, (1 + estimates.CONFIDENCE) / 2)
     return float(quantile * np.std(differences, ddof=1) * np.sqrt(1 + 1 / seeds))
 
 
@@ -75,7 +65,7 @@ def _margin(pair: Pair) -> float:
     """The smallest difference worth mentioning."""
     if pair.resolution:
         return max(-OF_BASELINE * pair.baseline.mean(), pair.resolution)
-    return WORTH_MENTIONING * pair.everything
+    return estimates.WORTH_MENTIONING * pair.everything
 
 
 def _replication(part: SizedFinding) -> str:

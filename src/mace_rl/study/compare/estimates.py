@@ -46,9 +46,8 @@ def pairs_of(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> list[P
     """
     metric = {metric.name: metric for metric in all_metrics(settings)}.get(part.metric)
     pairs = [_pair(part, table[table["env"] == env], metric, settings) for env in part.environments]
-    if len(pairs) == 1:
-        return pairs
-    return [Pair._make(value / pair.everything for value in pair) for pair in pairs]
+    shares = [Pair._make(value / pair.everything for value in pair) for pair in pairs]
+    return shares if len(pairs) > 1 else pairs
 
 
 def find(part: Part, pairs: Sequence[Pair], margin: float, settings: MetricsConfig) -> Finding:

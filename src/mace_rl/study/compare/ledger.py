@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ class Judgement:
 
     outcome: str
     verdict: str  # the same in the words of its family
-    parts: Sequence[Finding]
+    parts: list[Finding]
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,5 @@ def _judgement(outcome: str, verdict: str, parts: list[dict[str, Any]]) -> Judge
         part["environments"] = tuple(part["environments"])
         missing = [key for key, value in part.items() if value is None and key != "baseline"]
         part |= dict.fromkeys(missing, math.nan)
-    kinds = [SizedFinding if "size" in part else Finding for part in parts]
-    found = [kind(**part) for kind, part in zip(kinds, parts, strict=True)]
-    return Judgement(outcome, verdict, found)
+    kind = SizedFinding if "size" in parts[0] else Finding
+    return Judgement(outcome, verdict, [kind(**part) for part in parts])

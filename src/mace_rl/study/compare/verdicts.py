@@ -14,13 +14,7 @@ import pandas as pd
 
 from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, FamilyConfig, Part, Table1Config
 from mace_rl.study.compare import direction_and_size
-from mace_rl.study.compare.estimates import (
-    FEWEST_SEEDS,
-    LEVEL,
-    WORTH_MENTIONING,
-    find,
-    pairs_of,
-)
+from mace_rl.study.compare.estimates import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING, find, pairs_of
 from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import holm
 from mace_rl.study.measure.metrics import all_metrics
@@ -30,9 +24,8 @@ from mace_rl.study.metrics_config import MetricsConfig
 def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -> list[Answer]:
     """An answer to each claim that the runs in `table` can answer.
 
-    table: the frame of metrics.csv with those of `CORRELATIONS` that the claims ask for; seeds may
-    differ between environments, not between variants. Of one seed there are no intervals and no
-    tests: NaN.
+    table: the frame of metrics.csv with the `CORRELATIONS` asked for; seeds may differ between
+    environments, not between variants. Of one seed there are no intervals and no tests: NaN.
     """
     lacking = claims.lacking(table["env"], table["variant"], settings)
     return [
@@ -75,11 +68,7 @@ def _answers(
 def judge(
     parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig, rule: int
 ) -> list[Any]:
-    """What each part came out as by a rule, their p values corrected together.
-
-    Those for a difference and those against one are corrected apart. A part that one seed leaves
-    without a p value counts as one of 1.
-    """
+    """What each part came out as; p values of either kind are corrected for all parts."""
     find_by_rule, decided = RULES[rule]
     findings = [find_by_rule(part, table, settings) for part in parts]
     different = _corrected([finding.p_value for finding in findings])
@@ -112,7 +101,7 @@ def outcome(finding: Finding) -> str:
 
 
 def _corrected(p_values: Sequence[float]) -> list[float]:
-    """Holm's p values; NaN where there was none."""
+    """Holm's p values; NaN where there was none, because of one seed, which counts as 1."""
     adjusted = holm([1.0 if np.isnan(p) else p for p in p_values])
     return [p if np.isnan(p) else float(q) for p, q in zip(p_values, adjusted, strict=True)]
 

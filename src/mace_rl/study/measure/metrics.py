@@ -138,10 +138,8 @@ def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
     noise. Entry i belongs to episode 2 · ceil(window / 10) + i.
     """
     first = 2 * math.ceil(window / 10)
-    growing = [
-        slope(returns[t % 2 : t], t // 2)  # one entry; of an odd number without the first
-        for t in range(first, min(2 * window, len(returns) + 1))
-    ]
+    ends = range(first, min(2 * window, len(returns) + 1))
+    growing = [slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
     return np.concatenate([*growing, slope(returns, window)])
 
 
@@ -162,8 +160,7 @@ def stagnation_correlations(curve: LearningCurve, betas: np.ndarray) -> tuple[fl
     """
     reached = sample_efficiency_common(curve)
     stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
-    start = len(betas) - len(stagnation)  # episodes before that of the first entry
-    until = max(0, reached.number - start)
+    until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
     before = _correlation(stagnation[:until], betas[: reached.number])
     after = _correlation(stagnation[max(0, until - 1) :], betas)
     return before, 0.0 if reached.censored else after

@@ -12,9 +12,8 @@ import pandas as pd
 from mace_rl.config.section import ConfigError
 from mace_rl.records import RecordError, RunKey, read_table
 from mace_rl.study.measure.metrics import (
-    AFTER,
-    BEFORE,
     CORRELATION,
+    CORRELATIONS,
     Attained,
     LearningCurve,
     Metric,
@@ -29,8 +28,8 @@ from mace_rl.study.metrics_config import MetricsConfig
 
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:
     """The columns of betas.csv; without a common bar nothing is before or after it."""
-    measured = ["beta_end", "beta_lowest", "beta_highest", CORRELATION]
-    measured += [BEFORE, AFTER] if settings.reference_return else []
+    measured = ["beta_end", "beta_lowest", "beta_highest"]
+    measured += CORRELATIONS if settings.reference_return else [CORRELATION]
     return {"env": str, "variant": str, "seed": int} | dict.fromkeys(measured, float)
 
 

@@ -28,10 +28,11 @@ PARTS = (
     f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
     " correction."
 )
-BY_SIZE = (  # what parts have by the second rule
-    " *Room*: how much better than the second any run could be, or is. *One seed*: where our"
-    " difference would lie if the paper's, of one run each, is by chance what it is."
-)
+PARTS_BY_RULE = {
+    1: PARTS,
+    2: f"{PARTS} *Room*: how much better than the second any run could be, or is. *One seed*: where"
+    " our difference would lie if the paper's, of one run each, differed from it by chance.",
+}
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
 
@@ -72,11 +73,6 @@ def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
 
 
-def parts_note(claims: ClaimsConfig) -> str:
-    """What the columns of parts are."""
-    return PARTS + BY_SIZE if claims.rule == 2 else PARTS
-
-
 def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
     """Family by family the verdicts, and then the parts in each way to measure them."""
     for title, own in by_family(answers).items():
@@ -86,7 +82,7 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
         yield Section(title.capitalize(), note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
-            yield Section(f"Part by part: {how}", parts_note(claims), frame, level=3)
+            yield Section(f"Part by part: {how}", PARTS_BY_RULE[claims.rule], frame, level=3)
 
 
 def of_runs(

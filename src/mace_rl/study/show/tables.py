@@ -24,7 +24,6 @@ from mace_rl.study.show.cells import Cell, Value, estimate, number
 
 CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
-BY_SIZE = ["room", "one seed", "replication", "size"]  # of parts, by the second rule
 SOLVED = 0.9  # of the last episodes, for a seed to count
 
 
@@ -234,9 +233,8 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
             ]
         )
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
-    heads += ["margin", "detectable"]
-    more = [*BY_SIZE, ""] if rows and len(rows[0]) > len(heads) + 1 else [""]
-    return pd.DataFrame(rows, columns=[*heads, *more])
+    heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
+    return pd.DataFrame(rows, columns=[*heads[: len(rows[0]) - 1], ""])
 
 
 def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
