@@ -67,7 +67,6 @@ def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
         (2, 20, WORST, 0.02, BUT_C6, "reversed"),
         (2, 20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),
         (2, 12, SMALL, 0.3, BUT_C6, "open"),
-        (2, 9, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
         (2, 1, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
     ],
 )
@@ -239,11 +238,9 @@ def test_the_ledger_is_read_as_it_was_written(tmp_path: Path, claims: ClaimsConf
         ((6, 9), 0.049, 0.9, ("shown", "worth mentioning"), {}),
         ((3, 8), 0.049, 0.9, ("shown", "open"), {}),
         ((-9, -6), 0.049, 0.9, ("reversed", "worth mentioning"), {}),
-        ((-4, -1), 0.049, 0.001, ("reversed", "small"), {}),
         ((-3, 4), 0.05, 0.049, ("absent", "small"), {}),
         ((-3, 4), 0.05, 0.05, ("open", "small"), {}),
         ((-3, 5), 0.9, 0.001, ("open", "open"), {}),  # the interval reaches the margin
-        ((-5, 4), 0.9, 0.001, ("open", "open"), {}),
         ((-3, 4), 0.9, 0.001, ("absent", "small"), {"room": 5.0}),
         ((-3, 4), 0.9, 0.001, ("no_room", "small"), {"room": 4.99}),
         ((1, 4), 0.049, 0.001, ("shown", "small"), {"room": 4.0}),
@@ -267,20 +264,21 @@ def test_what_could_not_improve_could_not_be_asked(study: Study) -> None:
     draws, acrobot = np.random.default_rng(5), frame["env"] == "Acrobot-v1"
     frame.loc[acrobot, "sample_efficiency_common"] = draws.integers(58, 63, acrobot.sum())
     frame.loc[acrobot, "final_return"] = draws.normal(-86, 1, acrobot.sum())
-    answers = verdicts.ledger(frame, study.metrics, BY_SIZE)
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    answers = verdicts.ledger(frame, settings, BY_SIZE)
     judged = {one.claim: one.ways[ROBUST] for one in answers}
     assert (judged["C1"].outcome, judged["C1"].verdict) == ("no_room", "could not be asked")
     assert [part.outcome for part in judged["C7"].parts] == ["no_room"] * 2 + ["absent"] * 2
     assert judged["C7"].verdict == "not reproduced"  # for Hopper's sake
-    hopper = frame["env"] == "HopperBulletEnv-v0"
-    frame.loc[hopper, "final_return"] = draws.normal(900, 900, hopper.sum())
-    judged = {one.claim: one for one in verdicts.ledger(frame, study.metrics, BY_SIZE)}
+    frame.loc[~acrobot, "final_return"] = draws.normal(900, 900, (~acrobot).sum())
+    judged = {one.claim: one for one in verdicts.ledger(frame, settings, BY_SIZE)}
     assert judged["C7"].ways[ROBUST].verdict == "open"
 
 
 def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    answers = {one.claim: one.ways for one in verdicts.ledger(frame, study.metrics, BY_SIZE)}
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    answers = {one.claim: one.ways for one in verdicts.ledger(frame, settings, BY_SIZE)}
     runs = frame.set_index(["env", "variant", "seed"]).sort_index()
     efficiency = runs.loc["Acrobot-v1", "sample_efficiency_common"]
     (part, _), mean = answers["C1"][ROBUST].parts, efficiency["ppo"].mean()
@@ -290,12 +288,9 @@ def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> 
     assert (part.predicted_low, part.predicted_high) == pytest.approx(chance)
     assert part.low > -63 and chance[0] < part.difference < chance[1]
     assert part.replication == "within one seed's chance"
-    alike = (
-        replace(part, in_paper=part.difference),
-        replace(part, predicted_high=part.difference - 1),
-    )
-    said = [direction_and_size.decided(one).replication for one in alike]
-    assert said == ["agrees", "disagrees"]
+    for changed, said in (("in_paper", "agrees"), ("predicted_low", "disagrees")):
+        one = replace(part, **{changed: part.difference + (changed != "in_paper")})
+        assert direction_and_size.decided(one).replication == said
     best = max(-85.0, runs.loc["Acrobot-v1", "final_return"].max())
     part = answers["C7"][ROBUST].parts[0]
     assert part.room == pytest.approx(best - runs.loc[("Acrobot-v1", "ppo"), "final_return"].mean())

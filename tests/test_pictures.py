@@ -113,11 +113,8 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
 def test_every_picture_can_be_drawn_and_is_the_same_again(
     runs, ledgers, settings, study, tmp_path, name
 ):
-    sources = {
-        "forest": ledgers[0],
-        "forest of questions": ledgers[1],
-        "forest by size": ledgers[2],
-    }
+    forests = "forest", "forest of questions", "forest by size"
+    sources = dict(zip(forests, ledgers, strict=True))
     source = Source({"metrics": runs}, sources.get(name, []), settings, CLAIMS)
     name = name.partition(" ")[0]
     names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}

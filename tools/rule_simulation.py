@@ -6,7 +6,6 @@ Of 10 · STUDIES parts whose difference is the margin, how many in % are absent,
 the rule; then, of STUDIES (100) drawn from the runs of reference/tables/study, what they say, in %.
 """
 
-import os
 import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -101,7 +100,7 @@ def outcomes(truth: str, seeds: int, number: int) -> list[list[str]]:
 
 
 def main(studies: int) -> None:
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ProcessPoolExecutor() as pool:
         print("differences | seeds | test alone | and the interval | and Holm")
         for cell in product(SPREADS, SEEDS):
             shares = pool.map(absences, *map(repeat, cell), [10 * studies] * 2, (-1, 1))
