@@ -56,12 +56,8 @@ bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour
 	@$(call one_of,BENCH,quick)
 	@$(IN_VENV) benchmarks $(if $(BENCH),--quick)
 
-verify: setup ## repeat a sample of the short runs and three of the study, and compare to the bit (SAMPLE=3)
+verify: setup ## repeat a sample of the nine short runs and compare to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
-	folder=$$(mktemp -d)
-	trap 'rm -rf "$$folder"' EXIT
-	$(IN_VENV) tools.kept_runs unpack reference/study "$$folder" --sample 3 >/dev/null
-	$(IN_VENV) mace_rl.cli verify "$$folder"
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
 	@$(call one_of,CROSS,short)

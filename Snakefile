@@ -30,6 +30,7 @@ localrules:
     tables_page,
     figure,
     picture,
+    readings,
     page,
 
 
@@ -41,5 +42,6 @@ rule all:
         rules.table2.output,
         rules.tables_page.output,
         expand(rules.figure.output, number=[1, 2]),
-        expand(rules.picture.output, picture=[*PICTURES, *READ]),
+        expand(rules.picture.output, picture=PICTURES),
+        rules.readings.output if READ else [],
         rules.claims.output if LEDGER else [],

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -25,9 +25,6 @@ from mace_rl.config.section import check
 from mace_rl.environments import registered
 from mace_rl.study.config import Study, read_study
 
-if TYPE_CHECKING:
-    from mace_rl.agent.ppo import PPO
-
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 
 # Where the tests run in the background SIGINT is ignored, and would be in what they start, too.
@@ -35,10 +32,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """What shares a finished study stays in one process; all else goes where there is time.
-
-    pytest-xdist's marks for groups (3.8) do nothing under pytest 9.2.
-    """
+    """What shares a finished study stays in one process: pytest-xdist's own marks do nothing."""
     from xdist.scheduler import LoadScopeScheduling
 
     class ByStudy(LoadScopeScheduling):
@@ -62,9 +56,7 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
     Sections merge: `ppo={"epochs": 1}` leaves the rest of that section as it is.
     """
 
-    def make(
-        environment: str = "CartPole-v1", variant: str = "ppo", seed: int = 0, **changes: Any
-    ) -> RunConfig:
+    def make(environment="CartPole-v1", variant="ppo", seed=0, **changes: Any) -> RunConfig:
         settings = study.run_config(environment, variant, seed).settings()
         return check(RunConfig, merge_layers(settings, changes), "the test")
 
@@ -100,9 +92,7 @@ def make_ppo(run_config):
     from mace_rl import factories
     from mace_rl.streams import Streams
 
-    def make(
-        environment="CartPole-v1", seed=0, intrinsic=False, engine="compiled", **settings
-    ) -> "PPO":
+    def make(environment="CartPole-v1", seed=0, intrinsic=False, engine="compiled", **settings):
         config = run_config(environment, "ppo", seed, ppo=settings, engine=engine)
         return factories.ppo(config, environment_of(environment, seed), intrinsic, Streams(seed))
 
@@ -186,13 +176,10 @@ def completes(tmp_path):
 
 @pytest.fixture
 def interrupted(run_config, tmp_path, kill, checkpoint_every, monkeypatch):
-    """A run of CartPole-v1, killed after a checkpoint: its configuration and folder.
-
-    It has told its progress once, after the first episode, however slow the machine is.
-    """
+    """A run of CartPole-v1, killed after a checkpoint: its configuration and folder."""
     from mace_rl.runs import run
 
-    monkeypatch.setattr(run, "PROGRESS_SECONDS", 1e9)
+    monkeypatch.setattr(run, "PROGRESS_SECONDS", 1e9)  # told once, after the first episode
     config = run_config("CartPole-v1", "mace_full", 0, episodes=6)
     checkpoint_every(1)
     kill(5, config, tmp_path / "run")

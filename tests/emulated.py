@@ -12,7 +12,7 @@ from typing import Any
 from unittest.mock import patch
 
 ROOT = Path(__file__).resolve().parents[1]
-# More than the 10 updates after which the meta network learns.
+# More than the 10 updates after which a β has its credit.
 EPISODES = {"Acrobot-v1": 14, "CartPole-v1": 60, "HopperBulletEnv-v0": 60}
 # So small that memory and buffer are full before the end, and what is in them is replaced.
 CHANGES = {"memory": {"capacity": 50}, "novelty": {"buffer_size": 100, "refresh_every": 32}}

@@ -1,7 +1,7 @@
 """Settings, and records and tables that no run has given, for several test files."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,37 +16,31 @@ from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import CORRELATION, Metric, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 
-SETTINGS = {
-    "final_fraction": 0.1,
-    "threshold": 0.75,
-    "moving_average": 50,
-    "convergence_slope": 0.1,
-    "convergence_band": 0.1,
-    "confidence": 0.95,
-    "bootstrap_repetitions": 1000,
-    "bootstrap_seed": 0,
-    "comparisons": [],
-    "random_return": {"CartPole-v1": 22.1, "Acrobot-v1": -499.1},
-    "reference_return": {"CartPole-v1": 400.0, "Acrobot-v1": -200.0},
-    "solved_return": {"CartPole-v1": 475.0, "Acrobot-v1": -100.0},
-}
+SETTINGS = {"final_fraction": 0.1, "threshold": 0.75, "moving_average": 50, "comparisons": []}
+SETTINGS |= {"convergence_slope": 0.1, "convergence_band": 0.1, "confidence": 0.95}
+SETTINGS |= {"bootstrap_repetitions": 1000, "bootstrap_seed": 0}
+SETTINGS["random_return"] = {"CartPole-v1": 22.1, "Acrobot-v1": -499.1}
+SETTINGS["reference_return"] = {"CartPole-v1": 400.0, "Acrobot-v1": -200.0}
+SETTINGS["solved_return"] = {"CartPole-v1": 475.0, "Acrobot-v1": -100.0}
 CONFIG = check(MetricsConfig, SETTINGS, "test")
 
 ROOT = Path(__file__).parents[1]
 STUDY = read_study([ROOT / "config.yaml"])
 CLAIMS = read_claims(STUDY, ROOT / STUDY.claims)
-PAPERS, QUESTIONS = (
-    CLAIMS.model_copy(update={"families": {title: family}})
-    for title, family in CLAIMS.families.items()
-)
+FAMILIES = CLAIMS.families.items()
+PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict([one])}) for one in FAMILIES)
 LITERAL, ROBUST = CLAIMS.ways
 by_rule = PAPERS.model_dump() | {"rule": 2}
 by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be asked"
 BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
+QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
+QUESTIONED = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})
 
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
 LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
+TIMES = ["sample_efficiency", "sample_efficiency_common"]
+TIMES += ["convergence_steps", "convergence_steps_public_code"]
 SEEDS = {"CartPole-v1": 12, "HopperBulletEnv-v0": 10}  # of `table_for_scores`
 
 
@@ -64,11 +58,7 @@ def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:
 
 
 def table_for_tables(
-    metrics: Sequence[Metric],
-    environments: Sequence[str] = ENVIRONMENTS,
-    variants: Sequence[str] = VARIANTS,
-    seeds: int = 3,
-    **values: Mapping[str, Sequence[float]],
+    metrics: Sequence[Metric], environments=ENVIRONMENTS, variants=VARIANTS, seeds=3, **values
 ) -> pd.DataFrame:
     """A metrics.csv; `values` are per variant, [seeds] each: `sample_efficiency={"ppo": [...]}`."""
     draws = np.random.default_rng(0)
@@ -94,17 +84,10 @@ def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> p
     """metrics.csv in which a variant is better by `advantage` of everything, in all it does."""
     draws = np.random.default_rng(1)
     rows = []
-    for env, variant, seed in itertools.product(
-        EPISODES, ("ppo", "mace_fixed", "mace_full"), range(seeds)
-    ):
+    for env, variant, seed in itertools.product(EPISODES, advantage, range(seeds)):
         row: dict[str, object] = {"env": env, "variant": variant, "seed": seed}
         row["episodes"] = EPISODES[env]
-        for name in (
-            "sample_efficiency",
-            "sample_efficiency_common",
-            "convergence_steps",
-            "convergence_steps_public_code",
-        ):
+        for name in TIMES:
             share = 0.5 - advantage[variant] + noise * draws.normal()
             row[name] = round(share * EPISODES[env])
         for name in ("final_return", "area_under_curve", "early_return"):

@@ -4,7 +4,8 @@ import copy
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import VectorEnv
 
 from mace_rl import cli
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
-from mace_rl.beta.lstm import CompiledMetaNetwork
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.files import LOCK
@@ -25,6 +26,7 @@ from mace_rl.numerics.network import CompiledMLP, Network, TorchNetwork
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.trainer import Trainer
 
+ROOT = Path(__file__).parents[1]
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
 VARIANTS = ["ppo", "mace_fixed", "mace_full"]
@@ -42,14 +44,13 @@ GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes":
 class Twin:
     """A network, or a policy, as its torch module in float64: outputs, gradients by autograd."""
 
-    def __init__(self, owner: Network | CompiledMetaNetwork | Policy) -> None:
+    def __init__(self, owner: Network | Policy) -> None:
         self.network = getattr(owner, "network", owner)
         self.module = copy.deepcopy(self.network.module()).double()
         log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
         self.log_std = torch.nn.Parameter(torch.from_numpy(log_std.astype(np.float64)))
 
     def parameters(self) -> list[torch.nn.Parameter]:
-        """Every parameter, in the order of the flat vector."""
         return [*self.module.parameters(), self.log_std]
 
     def flat(self, tensors: Iterable[torch.Tensor]) -> np.ndarray:
@@ -66,7 +67,6 @@ class Twin:
         return self.flat(torch.autograd.grad(loss, self.parameters(), **options))
 
     def __call__(self, inputs: np.ndarray) -> torch.Tensor:
-        """The outputs, [N, out]."""
         return self.module(torch.as_tensor(inputs, dtype=torch.float64))
 
     def policy(self, observations: np.ndarray) -> torch.distributions.Distribution:
@@ -78,7 +78,7 @@ class Twin:
         return torch.distributions.Categorical(logits=outputs)
 
 
-def laid_out(network: Network | CompiledMetaNetwork, arrays: list[np.ndarray]) -> np.ndarray:
+def laid_out(network: Network, arrays: list[np.ndarray]) -> np.ndarray:
     """Arrays like its module's parameters as one vector like the network's.
 
     A compiled network has its columns filled up to a multiple of 16 with zeros. What follows the
@@ -93,16 +93,7 @@ def laid_out(network: Network | CompiledMetaNetwork, arrays: list[np.ndarray]) -
     if isinstance(network, CompiledMLP):  # each layer's weights with the biases as a last row
         layers = zip(arrays[::2], arrays[1::2], strict=True)
         arrays = [filled(np.vstack([weights.T, biases])) for weights, biases in layers]
-    elif isinstance(network, CompiledMetaNetwork):
-        *gates, readout, readout_bias = arrays
-        gates = [filled(part.reshape(*part.shape[:-1], 4, -1)) for part in gates]
-        arrays = [*gates, filled(readout), readout_bias]
     return np.concatenate([part.ravel() for part in [*arrays, *rest]])
-
-
-def beta_of(twin: Twin, sequence: np.ndarray) -> torch.Tensor:
-    """The logistic function of the reference network's answer to what an episode was, [1]."""
-    return torch.sigmoid(twin(sequence))
 
 
 def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> ActingPolicy:
@@ -114,23 +105,16 @@ def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> Ac
 
 
 def layer_norm(inputs: int, outputs: int, hidden_units: list[int]) -> torch.nn.Module:
-    """A network of a user's own."""
     units = hidden_units[0]
-    return torch.nn.Sequential(
-        torch.nn.Linear(inputs, units),
-        torch.nn.LayerNorm(units),
-        torch.nn.ReLU(),
-        torch.nn.Linear(units, outputs),
-    )
+    hidden = torch.nn.Linear(inputs, units), torch.nn.LayerNorm(units), torch.nn.ReLU()
+    return torch.nn.Sequential(*hidden, torch.nn.Linear(units, outputs))
 
 
 def environment_of(name: str, seed: int = 0, *settings: Any) -> Environment:
-    """An environment seeded with `seed`."""
     return Environment(name, np.random.SeedSequence(seed), *settings)
 
 
 def finish(run: RunConfig | Trainer) -> Trainer:
-    """The trainer of a whole run, at its end."""
     trainer = run if isinstance(run, Trainer) else Trainer(run)
     for _ in trainer.run():
         pass
@@ -152,6 +136,27 @@ def likeliest(policy: torch.nn.Module, episodes: int, seed: int) -> list[float]:
     return returns
 
 
+def step(env, number: int):
+    """A step with an action that depends on its number alone, the same in several environments."""
+    vector = isinstance(env, VectorEnv)
+    space = env.single_action_space if vector else env.action_space
+    space.seed(number)
+    action = space.sample()
+    return env.step(np.full(env.num_envs, action) if vector else action)
+
+
+def play(env, steps: int, seed: int | None = 0, first=0) -> list[tuple]:
+    """What so many steps returned, episode after episode; from a reset, or on without a seed."""
+    if seed is not None:
+        env.reset(seed=seed)
+    found = []
+    for number in range(first, first + steps):
+        found.append(copy.deepcopy(step(env, number)))
+        if not isinstance(env, VectorEnv) and (found[-1][2] or found[-1][3]):
+            env.reset()
+    return found
+
+
 class Killed(BaseException):
     """Ends a run as a signal would: nothing in the program catches it."""
 
@@ -161,21 +166,25 @@ def files(directory: Path) -> list[str]:
     return sorted({path.name for path in directory.iterdir() if path.is_file()} - {LOCK})
 
 
+def content_of(directory: Path) -> dict[str, bytes]:
+    """The bytes of `files(directory)` by their names."""
+    return {name: (directory / name).read_bytes() for name in files(directory)}
+
+
 def provenance_of(directory: Path) -> dict:
     return json.loads((directory / "run.json").read_text(encoding="utf-8"))
 
 
 def contents(results: Path) -> dict[str, bytes]:
     """By name what a study has to give again: all but what tells of the circumstances."""
-    circumstances = {"logs", "benchmarks", "run.json", LOCK}
-    return {
-        # The claim ledger says how long all trainings took.
-        str(path.relative_to(results)): re.sub(rb"[^,\n]*core.hours.*", b"", path.read_bytes())
-        if path.stem == "claims"
-        else path.read_bytes()
-        for path in sorted(results.rglob("*"))
-        if path.is_file() and not circumstances.intersection(path.relative_to(results).parts)
-    }
+    circumstances, found = {"logs", "benchmarks", "run.json", LOCK}, {}
+    for path in sorted(results.rglob("*")):
+        name = path.relative_to(results)
+        if path.is_file() and not circumstances.intersection(name.parts):
+            found[str(name)] = path.read_bytes()
+            if path.stem == "claims":  # the claim ledger says how long all trainings took
+                found[str(name)] = re.sub(rb"[^,\n]*core.hours.*", b"", found[str(name)])
+    return found
 
 
 def call(monkeypatch, *words: str) -> tuple[int, str]:
@@ -188,13 +197,27 @@ def call(monkeypatch, *words: str) -> tuple[int, str]:
     return 0, ""
 
 
+def refusal(monkeypatch, *words: str) -> str:
+    """The line with which `mace-rl words` fails."""
+    code, said = call(monkeypatch, *words)
+    assert code == 1 and "\n" not in said
+    return said
+
+
 def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
-    """What the tool exits with."""
     monkeypatch.setattr("sys.argv", [tool.__name__, *words])
     with pytest.raises(SystemExit) as ended:
         tool.main()
     assert isinstance(ended.value.code, str) and "\n" not in ended.value.code
     return ended.value.code
+
+
+@contextmanager
+def refused(error: type[Exception], pattern: str) -> Iterator[pytest.ExceptionInfo]:
+    """What is in the block is refused in one line, in which the pattern is found."""
+    with pytest.raises(error, match=pattern) as caught:
+        yield caught
+    assert "\n" not in str(caught.value)
 
 
 class Bonanza(gymnasium.Env):

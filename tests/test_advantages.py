@@ -37,7 +37,6 @@ def test_advantages_are_the_weighted_mean_of_k_step_ones(discount, gae_lambda):
 
 
 def discounted_sums(rewards: np.ndarray, discount: float) -> list[float]:
-    """At each step, by its definition."""
     steps = range(len(rewards))
     return [sum(discount ** (t - i) * rewards[i] for i in range(t + 1)) for t in steps]
 
@@ -46,9 +45,7 @@ def discounted_sums(rewards: np.ndarray, discount: float) -> list[float]:
 @pytest.mark.parametrize("gae_lambda", [0.9, 1.0])
 @pytest.mark.parametrize("terminated", [True, False])
 @pytest.mark.parametrize("scaled", [True, False])
-def test_truncation_bootstraps_and_termination_never(
-    make_ppo, kind, gae_lambda, terminated, scaled
-):
+def test_truncation_alone_bootstraps(make_ppo, kind, gae_lambda, terminated, scaled):
     """Of rewards as they are, or over the deviation of their discounted sums, these included."""
     settings = {"scale_rewards": scaled, "scale_advantages": scaled}
     ppo = make_ppo(intrinsic=True, gae_lambda=gae_lambda, **settings)
@@ -67,9 +64,6 @@ def test_truncation_bootstraps_and_termination_never(
         following = rewards[t] + 0.99 * ((1 - gae_lambda) * bootstrap + gae_lambda * following)
         assert returns[t] == pytest.approx(following, abs=1e-5)
         assert found[t] == pytest.approx(following - values[t], abs=1e-5)
-
-
-# --- Scales -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("smallest", [1e-8, 3.0])
@@ -109,9 +103,6 @@ def test_scales_of_several_episodes(make_ppo, kind, smallest, least, unit):
         assert ppo.advantage_scale(kind) == pytest.approx(max(math.sqrt(mean_square), least))
 
 
-# --- β as a relative strength -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("reward", "bonus"), [(128.0, 1.0), (64.0, 2.0**-10)])
 def test_units_do_not_matter(run_config, register, monkeypatch, reward, bonus):
     """To the bit, as a power of two rounds nothing; unscaled they do matter."""
@@ -137,9 +128,6 @@ def test_units_do_not_matter(run_config, register, monkeypatch, reward, bonus):
     for scaled in (True, False):
         same = learned(64.0, 1.0, scaled) == learned(reward, bonus, scaled)
         assert same == scaled
-
-
-# --- Normalised observations --------------------------------------------------------------------
 
 
 def test_observations_are_standardised_by_everything_seen_and_clipped(make_ppo):

@@ -1,17 +1,18 @@
-"""β by schedule and learned: each against a computation of its own."""
+"""β by schedule and by meta-adaptation: each against a computation of its own."""
 
+import copy
 import math
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete
 from shared import environment_of, finish
 
 from mace_rl.beta.controller import Effect
+from mace_rl.beta.credit import Integrator
+from mace_rl.beta.gauge import Gauge
+from mace_rl.beta.lstm import lstm_logit
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.progress import FAST, IMPROVEMENT, SLOW, Progress
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
@@ -22,18 +23,10 @@ ROOT = Path(__file__).parents[1]
 SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
 
 
-def episode_of(rng, name="CartPole-v1", length=20) -> Episode:
-    environment = environment_of(name)
-    size, space = environment.observation_size, environment.action_space
-    return Episode(
-        observations=rng.standard_normal((length + 1, size)).astype(np.float32),
-        actions=rng.integers(space.n, size=length)
-        if isinstance(space, Discrete)
-        else rng.standard_normal((length, *space.shape)).astype(np.float32),
-        log_probs=np.zeros(length, np.float32),
-        rewards=rng.standard_normal(length),
-        terminated=True,
-    )
+def episode_of(extrinsic_return: float) -> Episode:
+    """Of eight steps."""
+    rewards = np.r_[np.zeros(7), extrinsic_return]
+    return Episode(np.zeros((9, 1)), np.zeros(8, int), np.zeros(8), rewards, True)
 
 
 # --- Schedules ----------------------------------------------------------------------------------
@@ -64,7 +57,10 @@ def test_schedules_by_hand(run_config, beta, expected):
 @pytest.mark.parametrize(
     ("beta", "message"),
     [
-        ({"kind": "constant", "value": 1.5}, "beta.value is 1.5, but .* less than or equal to 1"),
+        (
+            {"kind": "constant", "value": 10.5},
+            "beta.value is 10.5, but .* less than or equal to 10",
+        ),
         ({"kind": "constant"}, "the key 'beta.value' is missing"),
         (SCHEDULE | {"floor": 0.5}, "beta .* floor is 0.5, which must not exceed initial, 0.4"),
         (SCHEDULE | {"flor": 0.1}, "unknown key 'beta.flor' .* 'floor'"),
@@ -76,120 +72,147 @@ def test_wrong_settings_get_one_line(run_config, beta, message):
     assert "\n" not in str(caught.value)
 
 
+# --- What the LSTM reads ------------------------------------------------------------------------
+
+
+def test_features_by_hand():
+    """Two episodes a window; returns 0 and 1, bonus 1, then a tenth of it a step."""
+    gauge = Gauge(200)
+    closed = [gauge.update(r, b, 10) for r, b in ((0, 10), (0, 10), (1, 1), (0, 1))]
+    assert closed == [False, True, False, True]
+    first, second = gauge.windows
+    assert first == pytest.approx([-0.98, 0, -1, 0, 0])  # no two returns differ
+    assert second == pytest.approx([-0.96, 0.5, 0, -1, -1], abs=1e-6)
+
+
+@pytest.mark.parametrize(("budget", "windows"), [(30, 30), (100, 100), (250, 100), (6000, 100)])
+def test_windows_of_any_budget(budget, windows):
+    """A hundred, or one per episode; all features stay small whatever is paid."""
+    gauge, rng = Gauge(budget), np.random.default_rng(0)
+    for n in range(budget):
+        gauge.update(1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3)
+    assert len(gauge.windows) == windows and np.abs(gauge.sequence()).max() <= 4
+    assert gauge.windows[-1][0] == pytest.approx(1)
+
+
+# --- Meta-adaptation ----------------------------------------------------------------------------
+
+
 @pytest.fixture
 def make(run_config):
-    """`make(environment, initial, **settings of meta)`: the controller of mace_full."""
+    """`make(episodes, initial, **settings of meta)`: the controller of mace_full."""
 
-    def build(environment="CartPole-v1", initial=0.4, **settings) -> MetaAdaptation:
+    def build(episodes=1000, initial=0.4, **settings) -> MetaAdaptation:
         beta = {"kind": "meta", "initial": initial}
-        config = run_config(environment, "mace_full", 0, beta=beta, meta=settings)
-        return beta_controller(config, environment_of(environment), Streams(0))
+        changes = {"episodes": episodes, "beta": beta, "meta": settings}
+        config = run_config("CartPole-v1", "mace_full", 0, **changes)
+        return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
 
     return build
 
 
-# --- What the network is asked for --------------------------------------------------------------
-
-
 @pytest.mark.parametrize("initial", [0.05, 0.4, 0.9])
-@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-def test_beta_starts_at_initial_and_stays_in_0_to_1(make, environment, initial):
-    controller, rng = make(environment, initial, learning_rate=0.0), np.random.default_rng(0)
-    assert controller.beta == initial and not controller.learns  # frozen: untrained for ever
-    for scale in (1, 100, 1e4):
-        episode = episode_of(rng, environment)
-        episode.rewards[:] *= scale
-        controller.next_episode(episode, rng.random(20))
-        assert 0 < controller.beta < 1
-        assert controller.beta == pytest.approx(initial, abs=0.05)
+def test_beta_starts_at_initial_and_stays_there_without_its_parts(make, initial):
+    controller, alone = make(100, initial), make(100, initial, pretrained=False, credit_gain=0.0)
+    assert controller.learns and not alone.learns
+    for n in range(100):
+        assert (controller.beta == pytest.approx(initial)) == (n == 0)
+        assert alone.beta == pytest.approx(initial)
+        controller.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
+        alone.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
 
 
-@pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])
-@pytest.mark.parametrize(("length", "most"), [(9, None), (5, 6), (6, 6), (7, 6), (13, 6), (60, 6)])
-def test_sequence_is_state_action_reward_bonus_in_even_stretches(make, environment, length, most):
-    """Of consecutive steps, none left out: mean state and action, log of summed reward, bonus."""
-    controller, rng = make(environment, max_sequence=most), np.random.default_rng(0)
-    episode, bonus = episode_of(rng, environment, length), rng.random(length)
-    states = episode.observations[:-1]
-    controller.normaliser.update(3 + 2 * rng.standard_normal((50, states.shape[1])))
-    states[2, :2] = [1e6, -1e6]  # far from all that was seen
-    seen = ((states - controller.normaliser.mean) / controller.normaliser.std).clip(-10, 10)
-    acted = np.eye(2)[episode.actions] if environment == "CartPole-v1" else episode.actions
-    count = min(length, most or length)
-    rows = []
-    for start, end in pairwise(i * length // count for i in range(count + 1)):
-        reward, summed = episode.rewards[start:end].sum(), bonus[start:end].sum()
-        row = [*seen[start:end].mean(0), *acted[start:end].mean(0)]
-        row += [math.copysign(math.log(1 + abs(reward)), reward), math.log(1 + summed)]
-        rows.append([*row, *controller.progress.features(0.3)])
-    found = controller.sequence(episode, bonus, 0.3)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, rows, rtol=1e-4, atol=1e-6)
+@pytest.mark.parametrize("settings", [{}, {"pretrained": False}, {"credit_gain": 0.5}])
+def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, settings):
+    """Its logit, by another sum over all credits; at most 6."""
+    settings = {"horizon": 1, "credit_threshold": 0.5} | settings
+    controller, gauge, rng = make(200, **settings), Gauge(200), np.random.default_rng(0)
+    network, credits, betas = make().network, [], []
+    gain, known = settings.get("credit_gain", 4.0), -math.log(1.5)
+    for n in range(200):
+        direction = np.array([1.0, 0.5 * rng.standard_normal()], np.float32)
+        gradient = np.array([1.0 if n > 40 else -1.0, rng.standard_normal()], np.float32)
+        credit = controller.learn(gradient, 1.0, Effect(direction, 1.0))
+        credits += [] if credit is None else [credit]
+        expected = len(credits) * 200 / max(n, 1)  # of the whole training
+        z = sum(credits) / math.sqrt(max(np.square(credits).sum(), expected / 2, 1e-9))
+        logit = known + gain * (max(z - 0.5, 0) + min(z + 0.5, 0))
+        betas.append(controller.beta)
+        assert betas[-1] == pytest.approx(1 / (1 + math.exp(-np.clip(logit, -6, 6))), rel=1e-4)
+        controller.next_episode(episode_of(n % 7), np.full(8, 1 / (1 + n)))
+        if gauge.update(n % 7, 8 / (1 + n), 8) and settings.get("pretrained", True):
+            known = lstm_logit(gauge.sequence(), network)
+    assert len(credits) == 199 and max(betas) > 0.9 and min(betas) < 0.05
 
 
-# --- What is learned -----------------------------------------------------------------------------
+def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(make):
+    """What the LSTM has learned, where the bonus fades; without credit."""
+    found = np.where(np.arange(1000) < 300, 0.0, np.minimum(1, np.arange(1000) / 300 - 1))
+    betas = []
+    for returns in (np.zeros(1000), found):
+        controller = make(credit_gain=0.0)
+        for n, extrinsic_return in enumerate(returns):
+            betas.append(controller.beta)
+            controller.next_episode(episode_of(extrinsic_return), np.full(8, 0.3 / (1 + n / 30)))
+    searching, advancing = np.split(np.array(betas), 2)
+    assert searching[50:300].min() > 0.7 and advancing[50:300].min() > 0.7
+    assert advancing[600:].max() < 0.3
 
 
-def slow_progress(returns: list[float], beta: float) -> list[float]:
-    """`Progress.features` from the whole history."""
-    fast = slow = best = returns[0]
-    stalled = 0
-    for count, value in enumerate(returns[1:], start=2):
-        fast += max(FAST, 1 / count) * (value - fast)
-        slow += max(SLOW, 1 / count) * (value - slow)
-        stalled += 1
-        if fast > best + IMPROVEMENT * np.std(returns[:count]):
-            best, stalled = fast, 0
-    unit = np.std(returns) or 1.0
-    features = [(fast - slow) / unit, (best - fast) / unit, math.log(1 + stalled) / 2]
-    return [*features, math.log(beta / (1 - beta)) / 2]
+def test_restored_it_continues_to_the_bit(make):
+    one, other, rng = make(50, horizon=3), make(50, horizon=3), np.random.default_rng(0)
+    for n in range(50):
+        if n == 20:
+            other.load_state_dict(copy.deepcopy(one.state_dict()))
+        vectors = rng.standard_normal((2, 9)).astype(np.float32)
+        for meta in (one, other)[: 1 + (n >= 20)]:
+            meta.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
+            meta.learn(vectors[0], 0.5, Effect(vectors[1], 0.5))
+        assert n < 20 or one.beta == other.beta
+    assert one.integrator.logit == other.integrator.logit and one.integrator.count == 47
 
 
-@pytest.mark.parametrize(("trend", "noise"), [(0, 5), (1, 5), (0, 0), (-1, 5)])
-def test_progress_equals_a_slow_computation(trend, noise):
-    rng, progress = np.random.default_rng(0), Progress()
-    returns = [trend * n + noise * rng.standard_normal() for n in range(60)]
-    for count in range(1, 61):
-        progress.update(returns[count - 1])
-        expected = np.clip(slow_progress(returns[:count], 0.3), -3, 3)
-        np.testing.assert_allclose(progress.features(0.3), expected, rtol=1e-6, atol=1e-9)
-    assert (progress.features(0.3)[2] < 1.0) == (trend > 0)  # not stalled
-
-
-@pytest.mark.parametrize(("credit", "rises"), [(0.8, True), (-0.8, False)])
-def test_beta_follows_what_helped_and_comes_back_when_nothing_is_left_to_learn(make, credit, rises):
-    """Also from the very end of its range."""
-    controller, rng = make(horizon=1), np.random.default_rng(0)
-    gradient = np.array([1.0, 0.0], np.float32)
-    effect = Effect(np.array([credit, math.sqrt(1 - credit**2)], np.float32), 1.0)
-
-    def play(episodes: int, strength: float) -> float:
-        for _ in range(episodes):
-            controller.next_episode(episode_of(rng), rng.random(20))
-            controller.learn(strength * gradient, strength, [effect])
-            assert 0 < controller.beta < 1
-        return controller.beta
-
-    learned = play(150, 1.0)
-    assert (learned > 0.9) if rises else (learned < 0.1)
-    assert play(600, 1e-6) == pytest.approx(0.4, abs=0.05)
+# --- Credit -------------------------------------------------------------------------------------
 
 
 def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(make):
-    gradient, found = np.array([1.0, 0.0], np.float32), []
-    for advantage_rms in (0.5, 1.0, 3.0):
-        controller, rng, credit = make(horizon=1), np.random.default_rng(0), None
-        while credit is None:
-            controller.next_episode(episode_of(rng), rng.random(20))
-            credit = controller.learn(gradient, 1.0, [Effect(gradient, advantage_rms)])
-        found.append(credit)
-    # The gradient goes the effect's way, always as far: in its usual size, by 1.
-    assert found == pytest.approx([0.5, 1.0, 1.0])
+    """And so does extrinsic advantage."""
+    gradient = np.array([1.0, 0.0], np.float32)
+    for advantage_rms, strength, expected in (
+        *((0.5, 1.0, 0.5), (1.0, 1.0, 1.0), (3.0, 1.0, 1.0)),
+        *((1.0, 0.2, 0.2), (1.0, 5.0, 1.0), (1.0, 0.0, 0.0), (0.5, 0.5, 0.25)),
+    ):
+        controller = make(horizon=1)
+        controller.next_episode(episode_of(1), np.full(8, 0.5))
+        effect = Effect(gradient, advantage_rms)
+        credits = [controller.learn(strength * gradient, strength, effect) for _ in range(3)]
+        # The gradient goes the effect's way, always as far: in its usual size, by 1.
+        assert credits == [None, pytest.approx(expected), pytest.approx(expected)]
+
+
+@pytest.mark.parametrize(
+    ("signal", "low", "high"), [(0.1, 0.8, 1), (-0.1, 0, 0.1), (0.0, 0.2, 0.6), (0.02, 0.2, 0.95)]
+)
+def test_the_integrator_as_a_detector(run_config, signal, low, high):
+    """After 1500 invented credits with noise 1, β lies there in 9 of 10 seeds."""
+    config = run_config("CartPole-v1", "mace_full", 0).meta
+    paths = []
+    for seed in range(200):
+        integrator, rng = Integrator(config), np.random.default_rng(seed)
+        path = []
+        for n, credit in enumerate((signal + rng.standard_normal(1500)).clip(-3, 3)):
+            integrator.add(float(credit), (n + 1) / 1500)
+            path.append(1 / (1 + 1.5 * math.exp(-integrator.logit)))
+        paths.append(path)
+    inside = (np.array(paths) >= low) & (np.array(paths) <= high)
+    assert inside[:, -1].mean() >= 0.9
+    if signal == 0:  # nor does it leave on its way
+        assert inside.all(axis=1).mean() >= 0.85
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("problem", "low", "high"), [("Help", 0.6, 1), ("Harm", 0, 0.1), ("Nothing", 0.2, 0.6)]
+    ("problem", "low", "high"), [("Help", 0.6, 1), ("Harm", 0, 0.1), ("Nothing", 0.1, 0.6)]
 )
 def test_planted_problems(problem, low, high):
     """A bonus that helps, one that harms, one without any bearing; all starting from β = 0.4."""

@@ -19,11 +19,10 @@ from pathlib import Path
 
 import pytest
 from emulated import TABLES
-from shared import ENVIRONMENTS, OUTCOME, VARIANTS, provenance_of
+from shared import ENVIRONMENTS, OUTCOME, ROOT, VARIANTS, provenance_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.emulated]
 
-ROOT = Path(__file__).parents[1]
 QEMU = "qemu-x86_64"
 # Older ones read the wrong numbers where a gather, of which NumPy has many, has its index in ymm4:
 # https://gitlab.com/qemu-project/qemu/-/issues/2474
@@ -42,13 +41,9 @@ def carry_out(tasks: list[Task], scratch: Path, *prefix: str) -> None:
     """In a new process, whose command starts with `prefix` and whose numba cache is empty."""
     command = [*prefix, sys.executable, str(Path(__file__).with_name("emulated.py"))]
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [*command, json.dumps(tasks)],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(scratch / "numba"), "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        errors="replace",
-    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(scratch / "numba"), "PYTHONPATH": paths}
+    settings = {"env": environment, "capture_output": True, "text": True, "errors": "replace"}
+    done = subprocess.run([*command, json.dumps(tasks)], **settings)
     assert done.returncode == 0, done.stderr
 
 
@@ -73,19 +68,14 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("here")
     cells = list(PROCESSORS.values()) if SHORT else [*product(ENVIRONMENTS, VARIANTS)]
     tasks: list[Task] = [(*cell, str(folder / "-".join(cell)), False) for cell in cells]
-    tasks += [
-        (*cell, str(folder / "-".join([*cell, "half"])), True)
-        for cell in cells
-        if cell[1] == HALVED
-    ]
+    halved = [cell for cell in cells if cell[1] == HALVED]
+    tasks += [(*cell, str(folder / "-".join([*cell, "half"])), True) for cell in halved]
     carry_out(tasks if SHORT else [*tasks, ("tables", str(folder / "tables"))], folder)
     return folder
 
 
 @pytest.mark.parametrize("processor", PROCESSORS)
-def test_another_processor_gives_the_same_bits(
-    processor: str, emulator: str, here: Path, tmp_path: Path
-) -> None:
+def test_another_processor_gives_the_same_bits(processor, emulator, here, tmp_path) -> None:
     cells = [PROCESSORS[processor]] if SHORT else [*product(ENVIRONMENTS, VARIANTS)]
     there: list[Task] = []
     again: list[Task] = []  # and ended here
@@ -104,17 +94,9 @@ def test_another_processor_gives_the_same_bits(
         there.append(("tables", str(tmp_path / "tables")))
     carry_out(there, tmp_path, emulator, "-cpu", processor)
     carry_out(again, tmp_path / "here")
-    different = [
-        f"{name} of {found.name}"
-        for found, undisturbed in wanted.items()
-        for name in OUTCOME
-        if (found / name).read_bytes() != (undisturbed / name).read_bytes()
-    ]
-    for found in wanted:
-        if "here" in found.name and not provenance_of(found)["interruptions"]:
-            different.append(f"{found.name}: it was not continued, but started afresh")
+    compared = [(new / name, old / name) for new, old in wanted.items() for name in OUTCOME]
     made = [] if SHORT else [Path("tables", "reference", name) for name in TABLES]
-    different += [
-        str(path) for path in made if (tmp_path / path).read_bytes() != (here / path).read_bytes()
-    ]
-    assert different == []
+    compared += [(tmp_path / path, here / path) for path in made]
+    assert [str(new) for new, old in compared if new.read_bytes() != old.read_bytes()] == []
+    for found in wanted:
+        assert provenance_of(found)["interruptions"] or "here" not in found.name, found

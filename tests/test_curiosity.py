@@ -44,22 +44,36 @@ def make(run_config):
     ("similarity", "value", "expected"),
     [
         *((0.0, value, 1.0) for value in (-1000.0, 0.0, 1000.0)),  # unlike all: fully relevant
-        # Like what was: from 0 where it was as bad as it gets to 1 where it was as good ...
-        *((1.0, -20.0, 0.0), (1.0, -10.0, 0.25), (1.0, 0.0, 0.5), (1.0, 20.0, 1.0)),
-        *((1.0, -1000.0, 0.0), (1.0, 1000.0, 1.0)),  # ... and no further
-        (0.5, 10.0, 0.875),  # 1 − ½ (1 − ¾)
-        *((1.0, math.nan, math.nan), (math.nan, 0.0, math.nan)),  # which stops a run
+        # Like what was: 0 if it was a whole spread worse than usual or more ...
+        *((1.0, -20.0, 0.0), (1.0, -1000.0, 0.0), (1.0, -15.0, 0.25), (1.0, -5.0, 0.75)),
+        *((1.0, 0.0, 1.0), (1.0, 20.0, 1.0), (1.0, 1000.0, 1.0)),  # ... and 1 from usual on
+        (0.5, -5.0, 0.875),  # 1 - ½ · ¼
+        *((1.0, math.nan, math.nan), (math.nan, -20.0, math.nan)),  # which stops a run
     ],
 )
 def test_relevance_by_hand(similarity, value, expected):
-    """In returns from -20 to 20, or in another unit and shifted; and if none is better."""
+    """Of returns that are usually 0 and spread by 20, or in another unit and shifted."""
     for unit, shift in ((1.0, 0.0), (1000.0, 0.0), (0.5, 30.0), (0.01, -4.0)):
         recalled = np.float32([unit * value + shift])
-        found = relevance(np.float32([similarity]), recalled, -20 * unit + shift, 20 * unit + shift)
+        found = relevance(np.float32([similarity]), recalled, shift, 20 * unit)
         assert found == pytest.approx([expected], abs=1e-4, nan_ok=True)
-    for worst, best in ((0.0, 0.0), (100.0, 100.09), (-0.05, 0.04)):  # by the critic's errors
-        found = relevance(np.float32([similarity]), np.float32([value]), worst, best)
-        assert found == pytest.approx([1 - similarity], nan_ok=True)
+    for spread in (0.0, 0.01):  # hardly any differ: nothing is known to be unproductive
+        found = relevance(np.float32([similarity]), np.float32([value]), 0.0, spread)
+        assert found == pytest.approx([1 + 0 * similarity], nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("lucky", "expected"),
+    [(0, 1.0), (1, 1 - math.sqrt(1 / 999)), (100, 1 - 1 / 3), (500, 0.0), (900, 0.0)],
+)
+def test_luck_of_a_few_does_not_make_the_others_unproductive(make, lucky, expected):
+    """Of 1000 remembered returns some are 1, the others 0: q / √(q (1 - q)) below the mean."""
+    curiosity = make("FrozenLake-v1")
+    states = np.eye(16)[[0] * (1000 - lucky) + [1] * (lucky + 1)]
+    curiosity.remember(episode_of(states), np.r_[np.zeros(1000 - lucky), np.ones(lucky)])
+    found = curiosity.bonus(episode_of(np.eye(16)[[5, 0, 1 if lucky else 0]]))
+    assert found.similarity == pytest.approx([1, 1])
+    assert found.relevance == pytest.approx([expected, 1], abs=1e-3)
 
 
 def test_first_episode_is_wholly_new_and_without_a_memory_novelty_is_all(make):
@@ -77,7 +91,7 @@ def test_first_episode_is_wholly_new_and_without_a_memory_novelty_is_all(make):
 def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
     """Both factors recomputed from the parts on their own, before they take the episode in.
 
-    What is best and worst is what memory holds; the unit is the deviation of all that was visited.
+    What is usual is what memory holds; the unit is the deviation of all that was visited.
     """
     curiosity = make(memory={"write_every": 3})
     for seed in range(5):
@@ -99,8 +113,8 @@ def test_bonus_is_novelty_times_relevance_of_the_states_arrived_at(make):
         nearest = np.argsort(squares)[:10]
         kernel = 1 / (squares[nearest] + 0.1)
         recalled = (kernel * values[nearest, -1]).sum() / kernel.sum()
-        productivity = (recalled - values[:, -1].min()) / np.ptp(values[:, -1])
-        relevant = 1 - 0.1 * kernel.max() * (1 - productivity)
+        worse = (values[:, -1].mean() - recalled) / values[:, -1].std()
+        relevant = 1 - 0.1 * kernel.max() * min(max(worse, 0), 1)
         expected = novelty[t] * relevant, novelty[t], relevant, 0.1 * kernel.max()
         assert [part[t] for part in found] == pytest.approx(expected, rel=1e-3)
 
@@ -152,20 +166,22 @@ def test_memory_holds_one_step_in_write_every_across_episodes_and_each_last(make
 def test_the_outcome_of_a_chain_of_10_steps_is_remembered(make):
     """Reward at its end only, one step in 10 is written: the first of each episode, and the last.
 
-    Asked of the last state before the end, memory reads three entries of it, at distance 0 with
-    weight 1 / 0.1, and three of the start, at d² = 2 per dimension of 16 with 1 / 2.1.
+    Asked of the start, memory reads three entries of it, at distance 0 with weight 1 / 0.1, and
+    three of the last state before the end, at d² = 2 per dimension of 16 with 1 / 2.1. The mean of
+    both is usual, half their difference the spread.
     """
     curiosity = make("FrozenLake-v1", memory={})
     chain = episode_of(np.eye(16)[:11], rewards=[0] * 9 + [1])
     for _ in range(3):
         curiosity.remember(chain, 0.9 ** np.arange(9.0, -1, -1))
     weights = np.array([1 / 0.1, 1 / 2.1])
-    recalled = weights @ [1, 0.9**9] / weights.sum()
-    productivity = (recalled - 0.9**9) / (1 - 0.9**9)
-    found = curiosity.bonus(chain)
+    worst, best = 0.9**9, 1
+    recalled = weights @ [worst, best] / weights.sum()
+    found = curiosity.bonus(episode_of(np.eye(16)[[5, 0, 9]]))
     assert curiosity.normaliser.count == 0  # one-hot states as they are
-    assert found.similarity[8] == pytest.approx(1)
-    assert found.relevance[8] == pytest.approx(productivity, rel=1e-4) and productivity > 0.9
+    assert found.similarity == pytest.approx([1, 1])
+    worse = ((worst + best) / 2 - recalled) / ((best - worst) / 2)
+    assert found.relevance == pytest.approx([1 - worse, 1], rel=1e-4) and worse > 0.9
 
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])

@@ -4,13 +4,12 @@ import re
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import ROOT
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "sb3_ppo.py"
 
 
@@ -22,9 +21,8 @@ def run(*words: str) -> subprocess.CompletedProcess[str]:
 def test_prints_a_row_for_each_seed_and_what_came_out():
     done = run("--seeds", "2", "--first-seed", "1000", "--steps", "256")
     assert done.returncode == 0, done.stderr
-    assert re.findall(r"(?m)^\| (\w+) \|(?:[^|]+\|){4}$", done.stdout) == [
-        *("seed", "1000", "1001", "mean")
-    ]
+    rows = re.findall(r"(?m)^\| (\w+) \|(?:[^|]+\|){4}$", done.stdout)
+    assert rows == ["seed", "1000", "1001", "mean"]
     assert "with curiosity minus without, last tenth: " in done.stdout
 
 
@@ -62,13 +60,11 @@ def test_curiosity_changes_the_policy_and_not_what_is_counted():
 
 
 def test_what_the_page_shows_works(tmp_path, monkeypatch):
-    """Block after block, with a shorter training."""
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs" / "wrappers.md").read_text(encoding="utf-8")
     assert text.count("learn(10_000)") == 1
-    blocks = re.findall(
-        r"```python\n(.*?)```", text.replace("learn(10_000)", "learn(1)"), re.DOTALL
-    )
+    text = text.replace("learn(10_000)", "learn(1)")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 3
     names = {}
     for block in blocks:

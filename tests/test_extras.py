@@ -1,24 +1,30 @@
-"""The plugins in extras/, loaded as docs/extending.md names them: as a user's own are."""
+"""The plugins in extras/, loaded as docs/extending.md names them, and bonuses of one's own."""
 
 import io
 import math
 import re
-from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 import yaml
-from shared import call, finish
+from shared import ROOT, call, finish, play, refused
 
+from mace_rl.beta.schedule import Constant
+from mace_rl.bonus.flag import FlagNovelty
+from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
+from mace_rl.config.bonus import CuriosityBonus, CustomBonus
+from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
+from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import archive
 from mace_rl.runs.provenance import identity
+from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 from mace_rl.wrappers import CuriosityReward
 
-ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 ENTRIES = [yaml.safe_load(one) for one in re.findall(r"`(\w+: \{kind: custom.*?extras.*\})`", PAGE)]
 BASE = "prediction_error"  # of two of them
@@ -51,7 +57,6 @@ def test_the_page_names_every_plugin_and_readers_want_leave(trained, monkeypatch
 
 
 def test_a_package_counts_as_a_whole(run_config, tmp_path, monkeypatch):
-    """What two plugins share is code that a run depends on."""
     (tmp_path / "own").mkdir()
     for name in ("__init__", "rule", "shared_part"):
         (tmp_path / "own" / f"{name}.py").touch()
@@ -96,20 +101,120 @@ def test_a_rule_is_told_when_the_policy_changes(run_config):
         ("bandit:Bandit", BANDIT | {"arms": []}, r"arms is \[\], but .* at least 1 item"),
         ("bandit:Bandit", BANDIT | {"arms": [0, 2]}, "arms.1 is 2, but .* less than or equal to 1"),
         ("bandit:Bandit", BANDIT | {"arms": [0, 0]}, r"arms is \[0, 0\], but .* each β once"),
-        (
-            "bandit:Bandit",
-            BANDIT | {"window": 3},
-            "window is 3, .* hold each of the 4 arms",
-        ),
+        ("bandit:Bandit", BANDIT | {"window": 3}, "window is 3, .* hold each of the 4 arms"),
     ],
 )
 def test_wrong_arguments_get_one_line(run_config, plugin, arguments, message):
-    section, key = (
-        ("beta", "rule") if "be" in plugin or "bandit" in plugin else ("bonus", "estimator")
-    )
+    bonus = plugin.startswith(("icm", "rnd", "hashing"))
+    section, key = ("bonus", "estimator") if bonus else ("beta", "rule")
     entry = {"kind": "custom", key: f"extras.{plugin}", "arguments": arguments}
     config = run_config("CartPole-v1", "mace_fixed", **{section: entry})
     place = f"{section}.{key} has 'extras.{plugin}': arguments: "
-    with pytest.raises(ConfigError, match=place + message) as caught:
+    with refused(ConfigError, place + message):
         Trainer(config)
-    assert "\n" not in str(caught.value)
+
+
+# --- Bonuses of the user's own --------------------------------------------------------------------
+
+OWN = {"kind": "custom", "estimator": "test_extras:Fixed"}
+
+
+class Fixed(IntrinsicReward):
+    """A user's own: the number of actions, or of numbers in one, at every step."""
+
+    def __init__(self, spaces, generator):
+        self.value = float(spaces.action_size)
+
+    def bonus(self, episode):
+        return Bonus(np.full(len(episode), self.value))
+
+    def remember(self, episode, returns):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+def test_a_bonus_of_one_s_own(run_config):
+    config = run_config(variant="mace_fixed", bonus=OWN, episodes=3)
+    assert config.memory is config.novelty is None
+    trainer = finish(config)
+    last = trainer.diagnostics[-1]
+    assert np.isnan([last.novelty, last.relevance, last.similarity]).all() and last.bonus_share > 0
+    assert all(r.intrinsic_return == 2 * r.length for r in trainer.records)
+    assert config.references() == {"bonus.estimator": "test_extras:Fixed"}
+    for value, text in ((-0.5, r"is -0.5, which is not in \[0, 1e\+12\]"), (math.inf, "is inf")):
+        trainer = Trainer(config)
+        trainer.curiosity.value = value
+        with pytest.raises(NonFiniteError, match=f"episode 1: the curiosity bonus {text}"):
+            finish(trainer)
+
+
+def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
+    """Of the same kind it changes some keys; of another it leaves nothing of it."""
+    file = tmp_path / "over.yaml"
+    file.write_text(
+        "variants: [ppo, mace_fixed, other, alone]\n"
+        "variant_settings:\n"
+        "  other: {beta: {kind: constant, value: 1.0}, bonus: {kind: custom, arguments: {a: 2}}}\n"
+        "  alone: {beta: {kind: constant, value: 1.0}, bonus: {kind: curiosity}}\n"
+        "training: {bonus: {kind: custom, estimator: 'test_extras:Fixed', arguments: {b: 7}}}\n"
+    )
+    study = read_study([DEFAULTS, file])
+    bonuses = {v: study.run_config("CartPole-v1", v, 0).bonus for v in study.variants}
+    assert bonuses["ppo"] is None
+    assert bonuses["other"] == CustomBonus(**OWN, arguments={"a": 2, "b": 7})
+    assert bonuses["alone"] == CuriosityBonus(kind="curiosity")
+    assert bonuses["mace_fixed"] == CustomBonus(**OWN, arguments={"b": 7})
+
+
+RULE = {"kind": "custom", "rule": "test_extras:Noted"}
+
+
+class Noted(Constant):
+    beta = None
+
+    def __init__(self, generator, beta=0.5, learns=False):
+        self.beta, self.learns, self.shown = beta, learns, []
+
+    def next_episode(self, *shown):
+        self.shown.append(shown)
+
+
+class Everything(FlagNovelty):
+    def __init__(self, size, generator, value):
+        self.value = float(value)  # NaN is no argument, but as text
+
+    def __call__(self, states):
+        return np.full(len(states), self.value)
+
+
+def test_a_rule_of_the_user_s_own_sees_whole_episodes():
+    """In the wrapper."""
+    env = CuriosityReward(gymnasium.make("Pendulum-v1"), RULE)
+    found = play(env, 450)
+    (first, bonus), (second, _) = env.tracker.controller.shown
+    assert len(first) == len(second) == 200 and not first.terminated
+    assert first.actions.shape == (200, 1) and first.actions.dtype == np.float32
+    assert bonus.tolist() == [info["curiosity"] for *_, info in found[:200]]
+    assert first.rewards.tolist() == [info["reward_extrinsic"] for *_, info in found[:200]]
+    assert (first.observations[1:] == [item[0] for item in found[:200]]).all()
+    env = CuriosityReward(gymnasium.make("Pendulum-v1"), RULE | {"arguments": {"beta": 10.5}})
+    with pytest.raises(NonFiniteError, match=r"β is 10\.5"):
+        env.reset()
+
+
+@pytest.mark.parametrize("value", [0.25, 1.25, -0.5, np.nan])
+def test_a_novelty_of_the_user_s_own_is_asked_for_every_state(value):
+    own = {"estimator": "test_extras:Everything", "arguments": {"value": str(value)}}
+    settings = {"novelty": {"kind": "custom", **own}, "relevance": False}
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), **settings)
+    if value == 0.25:
+        assert {info["curiosity"] for *_, info in play(env, 100)} == {0.25}
+        assert env.tracker.curiosity.memory is None
+        return
+    with pytest.raises(NonFiniteError, match=f"the curiosity bonus is {value}"):
+        play(env, 1)

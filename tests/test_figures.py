@@ -1,60 +1,60 @@
-"""The figures over training: their data against pandas and scipy, and what files they give."""
+"""Figures and pictures: their data against pandas, scipy and loops, and what files they give."""
 
 import html
 import math
-import subprocess
-import sys
 from itertools import product
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-
-from mace_rl.records import RecordError
-from mace_rl.study.config import read_study
-from mace_rl.study.metrics_config import FigureConfig
-from mace_rl.study.show.curves import (
-    PlotStyle,
-    draw_figure,
-    figure_as_svg,
-    mean_curves,
-    quantity,
-    save_figure,
-    seed_curves,
+from invented import (
+    BY_SIZE,
+    CLAIMS,
+    QUESTIONED,
+    SEEDS,
+    STUDY,
+    table_for_claims,
+    table_for_questions,
+    table_for_scores,
 )
 
-STUDY = read_study([Path(__file__).parents[1] / "config.yaml"])
+from mace_rl.records import RecordError
+from mace_rl.study.compare.ledger import Answer
+from mace_rl.study.compare.statistics import mean_interval
+from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.config import Study
+from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
+from mace_rl.study.show import curves as c
+from mace_rl.study.show.pictures import PICTURES, Source
+
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
-RETURN, BETA = quantity("1", METRICS), quantity("2", METRICS)
+RETURN, BETA = c.quantity("1", METRICS), c.quantity("2", METRICS)
 LABELS = {"ppo": "PPO (Baseline)", "mace_full": "MACE-RL (Full β)"}
 COLOURS = {"ppo": "tab:blue", "mace_full": "tab:green"}
 
 
 def frames(environments=("A-v0", "B-v1"), seeds=3, episodes=40):
     draws = np.random.default_rng(0)
-    return {
-        run: pd.DataFrame(
-            {
-                "extrinsic_return": np.cumsum(draws.normal(size=episodes)),
-                "beta": draws.random(episodes) * (run[1] != "ppo"),
-            }
-        )
-        for run in product(environments, LABELS, range(seeds))
-    }
+    found = {}
+    for run in product(environments, LABELS, range(seeds)):
+        returns = np.cumsum(draws.normal(size=episodes))
+        beta = draws.random(episodes) * (run[1] != "ppo")
+        found[run] = pd.DataFrame({"extrinsic_return": returns, "beta": beta})
+    return found
 
 
 def data(shown=RETURN, runs=None, **shape):
-    single = seed_curves(runs or frames(**shape), shown)
-    return mean_curves(single, shown, METRICS), single
+    single = c.seed_curves(runs or frames(**shape), shown)
+    return c.mean_curves(single, shown, METRICS), single
 
 
 def draw(colours=COLOURS, shown=RETURN, runs=None, inset=None, **shape):
     layout = FigureConfig(columns=3, inset=inset)
-    look = PlotStyle(layout, 0.95, LABELS, colours, {})
-    return draw_figure(*data(shown, runs, **shape), shown, look)
+    look = c.PlotStyle(layout, 0.95, LABELS, colours, {})
+    return c.draw_figure(*data(shown, runs, **shape), shown, look)
 
 
 def at(frame, **values):
@@ -68,7 +68,7 @@ def at(frame, **values):
 )
 def test_a_seeds_curve_is_the_mean_of_the_episodes_so_far_and_ends_at_the_last(episodes, points):
     runs = frames(("A-v0",), 2, episodes)
-    single = seed_curves(runs, RETURN)
+    single = c.seed_curves(runs, RETURN)
     for (environment, variant, seed), run in runs.items():
         curve = at(single, env=environment, variant=variant, seed=seed)
         assert len(curve) == points
@@ -86,17 +86,8 @@ def test_mean_curves_against_scipy_point_by_point(shown):
         assert len(values) == row.n == 4
         assert row.mean == pytest.approx(values.mean())
         bounds = np.array(scipy.stats.t.interval(0.95, 3, values.mean(), values.sem()))
-        assert (row.lower, row.upper) == pytest.approx(
-            tuple(np.clip(bounds, *shown.limits or (-99, 99)))
-        )
-
-
-def test_one_seed_has_no_band_and_ten_the_same_bootstrap_every_time():
-    single = data(seeds=1)[0]
-    assert single[["lower", "upper"]].isna().all(axis=None) and single["mean"].notna().all()
-    curves, _ = data(seeds=10)
-    pd.testing.assert_frame_equal(curves, data(seeds=10)[0], check_exact=True)
-    assert ((curves["lower"] < curves["mean"]) & (curves["mean"] < curves["upper"])).all()
+        expected = np.clip(bounds, *shown.limits or (-99, 99))
+        assert (row.lower, row.upper) == pytest.approx(tuple(expected))
 
 
 def test_seeds_of_different_lengths_are_refused():
@@ -116,15 +107,13 @@ def test_figure_2_leaves_out_whoever_has_no_beta():
 
 
 def test_each_panel_shows_the_means_of_its_environment():
+    """A mean that covers another has gaps to see it by."""
     curves, _ = data(seeds=4)
     for axes in draw(seeds=4).axes:
         shown = {line.get_label(): line.get_ydata() for line in axes.lines}
         for variant, label in LABELS.items():
             expected = at(curves, env=axes.get_title(), variant=variant)["mean"]
             np.testing.assert_array_equal(shown[label], expected)
-
-
-def test_a_mean_that_covers_another_leaves_gaps_to_see_it_by():
     runs = frames(("A-v0",))
     equal = runs | {("A-v0", "mace_full", seed): runs["A-v0", "ppo", seed] for seed in range(3)}
     for given, expected in ((runs, ["-", "-"]), (equal, ["-", "--"])):
@@ -142,7 +131,7 @@ def test_labels_are_plain_text(monkeypatch):
     for label in ("$$", r"$\notacommand{$", r"$\lambda$ & <50 %> #~^{}", "long " * 12):
         monkeypatch.setitem(LABELS, "ppo", label)
         figure = draw()
-        assert f">{html.escape(label, quote=False)}<" in figure_as_svg(figure)
+        assert f">{html.escape(label, quote=False)}<" in c.figure_as_svg(figure)
         figure.draw_without_rendering()  # lays it out
         assert figure.legends[0].get_window_extent().width < figure.bbox.width
 
@@ -153,25 +142,13 @@ def test_the_same_data_gives_the_same_file_and_another_colour_does_not(tmp_path,
     for epoch, colours in (("0", COLOURS), ("1000000000", COLOURS), ("0", COLOURS | {"ppo": "k"})):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)  # what matplotlib would take for the time
         with matplotlib.rc_context(USERS if epoch != "0" else {}):
-            save_figure(draw(colours=colours, episodes=200, inset=0.9), tmp_path / f"figure.{kind}")
+            figure = draw(colours=colours, episodes=200, inset=0.9)
+            c.save_figure(figure, tmp_path / f"figure.{kind}")
         contents.append((tmp_path / f"figure.{kind}").read_bytes())
     assert contents[0] == contents[1] != contents[2]
     if kind == "pdf":  # vectors, and fonts that journals take
         assert b"/FontFile2" in contents[0]
         assert not any(word in contents[0] for word in (b"/Type3", b"/Subtype /Image", b"Creat"))
-
-
-@pytest.mark.slow
-def test_importing_results_modules_is_quick():
-    """Planning the workflow imports them; tables and figures do without torch altogether."""
-    heavy = {"torch", "numba", "gymnasium", "snakemake", "pybullet"}
-    slow = {"pandas", "matplotlib.figure", "seaborn", "scipy.stats", "torch", "numba"}
-    code = "import sys, mace_rl.study.{}; print(*(set({}) & set(sys.modules)))"
-    modules = {"claims_config": slow, "show.tables": heavy, "compare.comparisons": heavy}
-    for module, forbidden in modules.items():
-        command = [sys.executable, "-c", code.format(module, sorted(forbidden))]
-        run = subprocess.run(command, capture_output=True, text=True, check=True)
-        assert run.stdout.split() == []
 
 
 def test_an_inset_shows_a_beginning_in_which_most_is_learned():
@@ -183,3 +160,107 @@ def test_an_inset_shows_a_beginning_in_which_most_is_learned():
     [inset] = first.child_axes
     assert inset.get_xlim() == (0, 20) and not second.child_axes
     assert [line.get_xdata().tolist() for line in inset.lines] == [list(range(1, 21))] * 2
+
+
+# --- Pictures of all runs at once -----------------------------------------------------------------
+
+CONSTANTS = ["beta_1", "ppo"]
+NAMES = {metric.name: metric.label for metric in all_metrics(QUESTIONED)}
+
+
+@pytest.fixture(scope="module")
+def runs() -> pd.DataFrame:
+    """metrics.csv of three variants; in HopperBulletEnv-v0 all seeds of one are equal."""
+    frame = table_for_scores(SEEDS)
+    third = frame[frame["variant"] == "ppo"].assign(variant="beta_1")
+    third.loc[third["env"] == "HopperBulletEnv-v0", "area_under_curve"] = 0.1
+    frame = pd.concat([frame, third], ignore_index=True)
+    return frame.assign(solved=np.random.default_rng(1).uniform(0.8, 1, len(frame)))
+
+
+@pytest.fixture(scope="module")
+def ledgers() -> list[list[Answer]]:
+    advantage = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
+    claimed, asked = table_for_claims(12, advantage, 0.05), table_for_questions(12)
+    own = (claimed, CLAIMS), (asked, CLAIMS), (claimed, BY_SIZE)
+    return [ledger(table, QUESTIONED, claims) for table, claims in own]
+
+
+@pytest.fixture
+def settings(study: Study) -> MetricsConfig:
+    chosen = ConstantsConfig(learned="mace_full", fixed=CONSTANTS)
+    return study.metrics.model_copy(update={"constants": chosen, "bootstrap_repetitions": 500})
+
+
+def test_every_run_is_there_with_its_returns(runs, settings) -> None:
+    table = PICTURES["every_seed"].data(Source({"metrics": runs}, [], settings, CLAIMS))
+    assert len(table) == 2 * len(runs)
+    for row in table.sample(20, random_state=0).itertuples():
+        own = runs[(runs["env"] == row.env) & (runs["seed"] == row.seed)]
+        assert row.value == own.set_index("variant").loc[row.variant, row.metric]
+
+
+def test_constants_come_in_their_order_with_the_learned_one_last(runs, settings) -> None:
+    table = PICTURES["constants"].data(Source({"metrics": runs}, [], settings, CLAIMS))
+    names = sorted(set(table["variant"]))
+    labels, colours = {name: name for name in names}, dict.fromkeys(names, "C0")
+    look = c.PlotStyle(FigureConfig(columns=3), 0.95, labels, colours, {})
+    panels = PICTURES["constants"].draw(table, look).axes
+    for (environment, rows), axes in zip(table.groupby("env", sort=False), panels, strict=False):
+        assert len(axes.containers) == (rows["role"] != "learned").sum()  # dots with bars
+        assert list(rows["variant"][:2]) == CONSTANTS
+        roles = dict.fromkeys(CONSTANTS, "fixed") | {"mace_full": "learned"}
+        assert dict(zip(rows["variant"], rows["role"], strict=True)) == roles
+        for row in rows.itertuples():
+            own = runs[(runs["env"] == environment) & (runs["variant"] == row.variant)]
+            values = own["area_under_curve"].to_numpy()
+            assert (row.mean, row.seeds) == (values.mean(), len(values))
+            bounds = mean_interval(values, 0.95, 500, np.random.default_rng(0))
+            assert (row.low, row.high) == tuple(map(float, bounds))
+
+
+def test_a_seed_solves_its_task_if_nine_of_ten_last_episodes_do(runs, settings) -> None:
+    table = PICTURES["solved"].data(Source({"metrics": runs}, [], settings, CLAIMS))
+    for row in table.itertuples():
+        own = runs[(runs["env"] == row.env) & (runs["variant"] == row.variant)]["solved"]
+        assert (row.solved, row.seeds) == (sum(share >= 0.9 for share in own), len(own))
+
+
+@pytest.mark.parametrize("family", [0, 1, 2])
+def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, settings) -> None:
+    ledger = ledgers[family]
+    table = PICTURES["forest"].data(Source({}, ledger, settings, CLAIMS))
+    assert set(table["measured"]) == set(ledger[0].ways)
+    assert ("size" in table) == (family == 2)
+    for how, rows in table.groupby("measured"):
+        parts = [(one.ways[how], part) for one in ledger for part in one.ways[how].parts]
+        for (judged, part), (_, row) in zip(parts, rows.iterrows(), strict=True):
+            assert row["verdict"] == judged.verdict
+            for name in ("difference", "low", "high"):
+                assert row[name] * part.worth_mentioning == pytest.approx(getattr(part, name))
+            assert np.isnan(row["paper"]) == np.isnan(part.in_paper)
+            assert row["outcome"] == part.outcome and row["answer"] == judged.outcome
+        assert not rows.duplicated(["claim", "part"]).any()  # the words tell parts from each other
+
+
+@pytest.mark.parametrize(
+    ("name", "family"),
+    [
+        ("every_seed", 0),
+        ("constants", 0),
+        ("solved", 0),
+        ("forest", 0),
+        ("forest", 1),
+        ("forest", 2),
+    ],
+)
+def test_every_picture_is_the_same_again(runs, ledgers, settings, study, tmp_path, name, family):
+    source = Source({"metrics": runs}, ledgers[family], settings, CLAIMS)
+    names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}
+    look = c.PlotStyle(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"), NAMES)
+    table = PICTURES[name].data(source)
+    table.to_csv(tmp_path / "table.csv", index=False)
+    read = pd.read_csv(tmp_path / "table.csv", keep_default_na=False, na_values=[""])
+    for path, data in (("a.png", table), ("b.png", read)):
+        c.save_figure(PICTURES[name].draw(data, look), tmp_path / path)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

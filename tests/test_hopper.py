@@ -16,13 +16,12 @@ from mace_rl.environments.hopper import FastHopperBulletEnv
 Policy = Callable[[np.random.Generator, np.ndarray, int], np.ndarray]
 
 # Found by random search: linear in the state, with a swing added, it hops for some 400 steps.
-WEIGHTS = np.array(
-    [
-        [0.54, 0, 0, -0.8, 0, -1.24, 0, 0.95, 1.18, 0.88, 0.01, 2.58, -1.31, -0.81, 0],
-        [-1.29, 0, 0, 0.72, 0, 0.28, 0, 0.94, 0.64, -0.32, -0.86, -1.02, 2.14, 0.9, 0],
-        [0.57, 0, 0, -0.76, 0, -0.05, 0, -0.68, -0.34, -2.39, -0.11, -0.33, 0.37, 0.5, 0],
-    ]
-)
+WEIGHTS = """
+    0.54 0 0 -0.8 0 -1.24 0 0.95 1.18 0.88 0.01 2.58 -1.31 -0.81 0
+    -1.29 0 0 0.72 0 0.28 0 0.94 0.64 -0.32 -0.86 -1.02 2.14 0.9 0
+    0.57 0 0 -0.76 0 -0.05 0 -0.68 -0.34 -2.39 -0.11 -0.33 0.37 0.5 0
+"""
+WEIGHTS = np.array(WEIGHTS.split(), float).reshape(3, 15)
 OFFSETS = np.array([0.65, -0.3, 0.21])
 SWING = np.array([-0.36, -0.21, -0.03])
 
@@ -32,7 +31,6 @@ def uniform(bound: float, dtype: type = np.float32) -> Policy:
 
 
 def pushing(rng: np.random.Generator, state: np.ndarray, k: int) -> np.ndarray:
-    """Full torques, more often one way than the other: joints at their limits."""
     return np.sign(rng.uniform(-1, 2, 3)).astype(np.float32)
 
 
@@ -82,9 +80,7 @@ def step_both(ours: HopperBulletEnv, theirs: HopperBulletEnv, action) -> tuple[n
     return state, rest[1]
 
 
-def run_both(
-    ours: HopperBulletEnv, theirs: HopperBulletEnv, policy: Policy, steps: int, seed: int
-) -> list[int]:
+def run_both(ours, theirs, policy: Policy, steps: int, seed: int) -> list[int]:
     """Steps both environments side by side; the lengths of the finished episodes."""
     rng = np.random.default_rng(seed)
     state, lengths, length = reset_both(ours, theirs, seed), [], 0
@@ -126,7 +122,6 @@ def test_same_bits(pair, policy: Policy, steps: int, longest: int) -> None:
 
 
 def test_same_bits_away_from_the_plane(pair) -> None:
-    """Turned aside, where none of the sines, products and sums is a zero."""
     rng = np.random.default_rng(4)
     run_both(*pair, uniform(1.0), 50, seed=4)
     for _ in range(20):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import message
 
 from mace_rl import files
 from mace_rl.records import rounded, write_episodes
@@ -41,11 +42,9 @@ def make_run(folder: Path, number: int, agent: bytes = b"agent", episodes: int =
 
 def content(folder: Path) -> dict[str, bytes]:
     """The files in a folder but for agents that are not kept."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and (path.name != files.AGENT or path.parent.name == "seed100")
-    }
+    found = {path for path in folder.rglob("*") if path.is_file()}
+    found -= {path for path in folder.rglob(files.AGENT) if path.parent.name != "seed100"}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(found)}
 
 
 def test_what_was_packed_comes_out(tmp_path: Path) -> None:
@@ -99,19 +98,15 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
 
 @pytest.mark.parametrize("command", ["pack", "unpack"])
 @pytest.mark.parametrize("folder", ["nope", "without a finished run"])
-def test_where_there_are_no_runs_nothing_is_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, folder: str
-) -> None:
+def test_where_there_are_no_runs_nothing_is_done(tmp_path, monkeypatch, command, folder) -> None:
     origin, goal = tmp_path / folder, tmp_path / "goal"
     (tmp_path / "without a finished run/runs/A-v1/ppo/seed0").mkdir(parents=True)
     make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
     kept_runs.pack(tmp_path / "results", goal)  # what is there already does not count
     before = content(tmp_path)
     wanted = {"pack": "runs/ENV/VARIANT/seedN/run.json", "unpack": "ENV/VARIANT.tar.xz"}[command]
-    monkeypatch.setattr("sys.argv", ["kept_runs", command, str(origin), str(goal)])
-    with pytest.raises(SystemExit) as ended:
-        kept_runs.main()
-    assert ended.value.code == f"kept_runs: {origin}: no {wanted} in it"
+    said = message(monkeypatch, kept_runs, command, str(origin), str(goal))
+    assert said == f"kept_runs: {origin}: no {wanted} in it"
     assert content(tmp_path) == before
 
 
@@ -143,7 +138,6 @@ def test_a_sample_is_of_short_runs_of_different_archives(tmp_path: Path) -> None
 
 
 def tar_of(members: list[tuple[str, bytes, bytes]]) -> bytes:
-    """An archive of (name, data, type)."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
         for name, data, kind in members:
@@ -189,9 +183,7 @@ DAMAGED = [  # links and the like, and what is no archive
 
 
 @pytest.mark.parametrize(("said", "damage"), [*HOSTILE.items(), *(("", one) for one in DAMAGED)])
-def test_what_was_never_packed_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, damage: dict[str, bytes] | bytes
-) -> None:
+def test_what_was_never_packed_is_refused_in_one_line(tmp_path, monkeypatch, said, damage) -> None:
     make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
     kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     path = tmp_path / "kept/A-v1/ppo.tar.xz"
@@ -208,9 +200,7 @@ def test_what_was_never_packed_is_refused_in_one_line(
             kept_runs.read(odd)
     before = content(tmp_path)
     for sample in ([], ["--sample", "1"]):
-        words = ["kept_runs", "unpack", str(path.parents[1]), str(tmp_path / "goal"), *sample]
-        monkeypatch.setattr("sys.argv", words)
-        with pytest.raises(SystemExit, match=rf"ppo\.tar\.xz .*{re.escape(said)}") as ended:
-            kept_runs.main()
-        assert "\n" not in str(ended.value.code)
+        words = "unpack", str(path.parents[1]), str(tmp_path / "goal"), *sample
+        found = message(monkeypatch, kept_runs, *words)
+        assert re.search(rf"ppo\.tar\.xz .*{re.escape(said)}", found)
     assert content(tmp_path) == before

@@ -28,48 +28,39 @@ pytestmark = [pytest.mark.slow, pytest.mark.kill]
 EPISODES = {"Acrobot-v1": 60, "CartPole-v1": 300, "HopperBulletEnv-v0": 250}
 # Checkpoints as fast as they can be written: the moments to hit are then all through the training.
 OFTEN = os.environ | {"MACE_RL_CHECKPOINT_SECONDS": "0.05"}
-TRAIN = (
-    "import mace_rl.runs.run as r; r.CHECKPOINT_COST = 1.0; from mace_rl.cli import main; main()"
-)
+TRAIN = "import mace_rl.runs.run as r; r.CHECKPOINT_COST = 1.0; "
+TRAIN += "from mace_rl.cli import main; main()"
 ATTEMPTS = 3  # to hit a moment
 
 
 def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[bytes]:
-    """Begin a training in `folder`, in a process of its own."""
     command = [sys.executable, "-c", TRAIN, "train", "--env", environment, "--variant", variant]
     command += ["--seed", "0", "--episodes", str(EPISODES[environment]), "--out", str(folder)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=OFTEN)
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a training."""
     _, error = process.communicate()
     assert process.returncode == 0, error.decode()
 
 
 def names(folder: Path) -> set[str]:
-    """What is in `folder`, if it exists yet."""
     return set(os.listdir(folder)) if folder.exists() else set()
 
 
 def begun(folder: Path) -> bool:
-    """Whether the training in `folder` has saved its first checkpoint."""
     return files.CHECKPOINT in names(folder)
 
 
 def writing_checkpoint(folder: Path) -> bool:
-    """Whether a checkpoint is half written at this moment."""
     half = f".{files.CHECKPOINT}."
     return begun(folder) and any(name.startswith(half) for name in names(folder))
 
 
 def writing_results(folder: Path) -> bool:
-    """Whether some but not all results are there at this moment."""
-    found = names(folder)
-    half = tuple(f".{name}." for name in RESULTS)
-    return any(name.startswith(half) for name in found) or 0 < len(found & {*RESULTS}) < len(
-        RESULTS
-    )
+    found, half = names(folder), tuple(f".{name}." for name in RESULTS)
+    some = 0 < len(found & {*RESULTS}) < len(RESULTS)
+    return some or any(name.startswith(half) for name in found)
 
 
 MOMENTS = {"training": begun, "checkpoint": writing_checkpoint, "results": writing_results}
@@ -88,11 +79,6 @@ def kill_at(
     return False
 
 
-def cut_off(folder: Path) -> bool:
-    """Whether what is in `folder` has to be resumed: there is a checkpoint, and no end."""
-    return begun(folder) and files.RECORD not in names(folder)
-
-
 @pytest.fixture(scope="module", params=[*product(ENVIRONMENTS, VARIANTS)], ids="-".join)
 def undisturbed(request: pytest.FixtureRequest, tmp_path_factory) -> SimpleNamespace:
     """A training of each environment and variant that was let alone, its folder; its seconds from
@@ -109,9 +95,7 @@ def undisturbed(request: pytest.FixtureRequest, tmp_path_factory) -> SimpleNames
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_killed_training_ends_with_the_same_bits(
-    undisturbed: SimpleNamespace, moment: str, tmp_path: Path
-) -> None:
+def test_a_killed_training_ends_with_the_same_bits(undisturbed, moment, tmp_path) -> None:
     delay = random.uniform(0, 0.8 * undisturbed.seconds) if moment == "training" else 0.0
     for attempt in range(ATTEMPTS):  # a training may be faster than the undisturbed one
         folder = tmp_path / str(attempt)
@@ -119,7 +103,7 @@ def test_a_killed_training_ends_with_the_same_bits(
             break
     else:
         pytest.fail("each training ended before it was hit")
-    cut = cut_off(folder)
+    cut = begun(folder) and files.RECORD not in names(folder)  # has to be resumed
     finish(undisturbed.start(folder))
     assert files_in(folder) == RESULTS
     for name in OUTCOME:

@@ -14,7 +14,7 @@ import gymnasium
 import numba
 import numpy as np
 import pytest
-from shared import call
+from shared import OUTCOME, ROOT, call, refused
 
 import mace_rl
 from mace_rl import load_agent, settings, train
@@ -24,19 +24,16 @@ from mace_rl.numerics import compiling
 from mace_rl.records import read_episodes
 from mace_rl.refusal import Refusal
 
-ROOT = Path(__file__).parents[1]
 HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]
 
 
 def told(code: str) -> list:
-    """What a new process prints as JSON."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 
 
 @pytest.mark.slow
 def test_importing_loads_little_and_changes_nothing():
-    """Not even where numba keeps what somebody else compiles."""
     loaded, changed, cache = told(
         "import json, os, sys; before = dict(os.environ); import mace_rl.wrappers, numba; "
         "print(json.dumps([list(sys.modules), before != os.environ, numba.config.CACHE_DIR]))"
@@ -50,7 +47,6 @@ def test_importing_loads_little_and_changes_nothing():
 @pytest.mark.slow
 @pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.pins"])
 def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
-    """As those say themselves, which read it when they are imported."""
     numpy_has, torch_has = told(
         f"import {module}, json, torch; from numpy._core._multiarray_umath import __cpu_features__;"
         "print(json.dumps([__cpu_features__, torch.backends.cpu.get_cpu_capability()]))"
@@ -77,11 +73,11 @@ def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     assert settings("Blackjack-v1", max_episode_steps=9).max_episode_steps == 9
 
 
-OWN = {"kind": "custom", "arguments": {"d": {1}}}
+OWN, MODULE = {"kind": "custom", "arguments": {"d": {1}}}, {"kind": "torch", "module": "a:B"}
+DAY = datetime.date(2024, 1, 1)
 
 
 def given(value: object) -> dict:
-    """An argument of the environment."""
     return {"environment_arguments": {"d": value}}
 
 
@@ -89,9 +85,7 @@ MISTAKES = {
     "unknown key 'ppo.clpi'": {"ppo": {"clpi": 0.1}},
     "unknown key 'epsiodes' (value 3); the nearest known key is 'episodes'": {"epsiodes": 3},
     "variant has 'mace_ful'": {"variant": "mace_ful"},
-    "environment_arguments.d is datetime.date(2024, 1, 1), but it should be made of": given(
-        datetime.date(2024, 1, 1)
-    ),
+    "environment_arguments.d is datetime.date(2024, 1, 1), but it should be made of": given(DAY),
     "environment_arguments.d is [{1}], but": given([{1}]),
     "environment_arguments.d is {1: 2}, but": given({1: 2}),
     "environment_arguments.d is nan, but it should be made of finite": given(math.nan),
@@ -99,9 +93,7 @@ MISTAKES = {
     "beta.arguments.d is {1}": {"beta": OWN | {"rule": "a:B"}},
     "bonus.arguments.d is {1}": {"bonus": OWN | {"estimator": "a:B"}},
     "novelty.arguments.d is {1}": {"novelty": OWN | {"estimator": "a:B"}},
-    "ppo.network.arguments.d is {1}": {
-        "ppo": {"network": OWN | {"kind": "torch", "module": "a:B"}}
-    },
+    "ppo.network.arguments.d is {1}": {"ppo": {"network": OWN | MODULE}},
     "--max-episode-steps": {"environment": "Blackjack-v1"},
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
 }
@@ -109,9 +101,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize("message", MISTAKES)
 def test_a_mistake_gets_one_line(message):
-    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+    with refused(ConfigError, re.escape(message)):
         settings(**{"environment": "CartPole-v1"} | MISTAKES[message])
-    assert "\n" not in str(caught.value)
 
 
 class Text(str):
@@ -142,7 +133,7 @@ def test_train_is_the_command_and_calls_back_for_each_episode(monkeypatch, tmp_p
     assert call(monkeypatch, *command, str(tmp_path / "command")) == (0, "")
     run, told = settings("CartPole-v1", "mace_full", seed=5, episodes=8), []
     trained = train(run, told.append, tmp_path / "own")
-    for name in ("episodes.csv", "diagnostics.csv", "agent.pt"):
+    for name in OUTCOME:
         one, other = ((tmp_path / folder / name).read_bytes() for folder in ("command", "own"))
         assert one == other
     frame = read_episodes(tmp_path / "own" / "episodes.csv", 8)

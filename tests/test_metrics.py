@@ -1,15 +1,21 @@
-"""Metrics on curves whose answers are known by hand, and against plain loops."""
+"""Metrics on curves whose answers are known by hand and against loops; the table of all runs."""
 
+import sys
 from decimal import ROUND_CEILING, Decimal
+from itertools import product
 
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from invented import CONFIG, noisy
+from invented import CONFIG, SETTINGS, frame, noisy
 
+from mace_rl.config.section import ConfigError, check
+from mace_rl.records import RecordError, read_table
 from mace_rl.study.measure import metrics as m
+from mace_rl.study.measure import run_metrics as t
+from mace_rl.study.metrics_config import GOALS, MetricsConfig
 
 
 def ramp(flat_before, rise, flat_after):
@@ -63,11 +69,9 @@ CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.convergence_steps, np.arange(300), {"random": 0}, 300, True),
     (m.convergence_steps_steepest, [0, 0, 1, 1, 1, 1, 2, 2, 2, 2], SMALL, 6, False),  # the first
     (m.convergence_steps_steepest, COLLAPSE, {}, 750, False),  # moved by a late collapse
-    (m.convergence_steps_steepest, np.full(300, 0.1), {}, 300, True),
     (m.convergence_steps_steepest, np.arange(300)[::-1], {}, 300, True),
     (m.convergence_steps_steepest, np.arange(99), {}, 99, True),  # two windows short
     (m.convergence_steps_flattest, np.ones(99), {}, 99, True),
-    (m.convergence_steps_flattest, np.ones(100), {}, 100, False),
     (m.convergence_steps_public_code, np.ones(2000), {}, 586, False),  # its floor
     (m.convergence_steps_public_code, np.arange(2000), {}, 2000, True),
     (m.convergence_steps_public_code, 0.049 * np.arange(2000), {}, 586, False),
@@ -77,8 +81,6 @@ CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.convergence_steps_range, DIP, {"final": 100, "random": 0} | WIDE, 89, False),
     (m.sample_efficiency_range, [*[0] * 20, 100, *[0] * 29, *[100] * 50], BAR, 58, False),
     (m.sample_efficiency_range, np.full(20, 100), {"random": 0}, 20, True),  # within a window
-    (m.convergence_steps_range, np.full(20, 100), {"random": 0}, 20, True),
-    (m.sample_efficiency_range, LATE, BAR, 38, False),
     (m.sample_efficiency_range, WORSE, BAR, 28, False),  # a bar that falls with the end
     (m.sample_efficiency_common, LATE, BAR, 38, False),
     (m.sample_efficiency_common, WORSE, BAR, 100, True),  # one bar for all does not
@@ -97,9 +99,8 @@ def test_an_episode_by_hand(case):
 def test_every_reading_against_loops(seed):
     returns, window, random = noisy(seed), 25, -3.0
     average, final = averages(returns, window), np.mean(returns[-40:])
-    slopes = {
-        t: round(average[t] - average[t - window], 9) for t in average if t - window in average
-    }
+    before = {t: average[t - window] for t in average if t - window in average}
+    slopes = {t: round(average[t] - before[t], 9) for t in before}
     run = curve(returns, random=random, moving_average=window)
     bar, fifty = random + 0.75 * (final - random), [*averages(returns, 50).values()]
 
@@ -139,13 +140,11 @@ def test_the_last_part_is_rounded_up_in_decimal(fraction):
     assert m.solved(curve(np.arange(40), None, 0.0, (np.nan, 37.0))) == 0.75  # 36 to 39
 
 
-@pytest.mark.parametrize(
-    "metric",
-    [
-        *(m.sample_efficiency, m.sample_efficiency_range, m.convergence_steps),
-        *(m.convergence_steps_range, m.convergence_steps_steepest, m.convergence_steps_flattest),
-    ],
-)
+READINGS = [m.sample_efficiency, m.sample_efficiency_range, m.convergence_steps]
+READINGS += [m.convergence_steps_range, m.convergence_steps_steepest, m.convergence_steps_flattest]
+
+
+@pytest.mark.parametrize("metric", READINGS)
 def test_a_run_no_better_than_random_reaches_nothing(metric):
     returns = [-20] * 40 + [0] * 160
     for random in (0.0, 1.0):  # 75 % of 0 is reached in episode 41
@@ -173,10 +172,8 @@ def test_stagnation_goes_with_the_beta_of_the_next_episode():
     rise = (average - average.shift(window)).to_numpy()  # from episode 2 · window on
     stagnation = np.full(300, 7.0)
     stagnation[2 * window :] = -rise[2 * window - 1 : -1]  # of the episode before
-    found = [
-        m.stagnation_correlation(returns, np.roll(0.4 + 0.1 * stagnation, shift), window)
-        for shift in (0, -1, 1)
-    ]
+    betas = [np.roll(0.4 + 0.1 * stagnation, shift) for shift in (0, -1, 1)]
+    found = [m.stagnation_correlation(returns, beta, window) for beta in betas]
     assert found[0] == pytest.approx(1) and max(found[1:]) < 0.9
     assert m.stagnation_correlation(returns, 0.4 - 0.1 * stagnation, window) == pytest.approx(-1)
     assert m.stagnation_correlation(returns, np.full(300, 0.4), window) == 0
@@ -185,11 +182,11 @@ def test_stagnation_goes_with_the_beta_of_the_next_episode():
 def by_hand(returns, betas, window, episodes):
     """Stagnation after each of these episodes, over halves of what there is, with the next β."""
     pairs = []
-    for t in episodes:
-        h = min(window, t // 2)
-        last, before = returns[t - h : t], returns[t - 2 * h : t - h]
-        pairs.append([round((np.mean(before) - np.mean(last)) / h, 9), betas[t]])
-    return pd.DataFrame(pairs).corr(method="spearman").iloc[0, 1] if pairs else 0
+    for episode in episodes:
+        h = min(window, episode // 2)
+        before, last = returns[episode - 2 * h : episode][:h], returns[episode - h : episode]
+        pairs.append([round((np.mean(before) - np.mean(last)) / h, 9), betas[episode]])
+    return pd.DataFrame(pairs).corr(method="spearman").iloc[0, 1]
 
 
 @pytest.mark.parametrize("window", [10, 25])
@@ -222,3 +219,196 @@ def test_no_run_is_earlier_than_a_metric_can_be(metric):
     curves = [noisy(seed) for seed in range(20)] + [at_once, risen]
     found = [metric.function(curve(own, random=-1e4, goals=(500.0,))).number for own in curves]
     assert 0 <= min(found) - metric.earliest(50, 400) <= 1
+
+
+# --- metrics.csv ----------------------------------------------------------------------------------
+
+ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
+    "env": "CartPole-v1",
+    "variant": "ppo",
+    "seed": 4,
+    "episodes": 1000,
+    "env_steps": 9000,
+    "final_return": 500.0,
+    "sample_efficiency": 201,
+    "convergence_steps": 295,  # the slope has come down from 480 / 50 to a tenth of that
+    "area_under_curve": 404.0,
+    "early_return": 20.0,
+    "solved": 1.0,
+    "sample_efficiency_common": 230,  # 22.1 + 0.75 · 377.9 = 305.5: 30 of 50 episodes at 500
+    "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
+    "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
+    "convergence_steps_steepest": 300,  # both windows of 50 at 500: episodes 201 to 300
+    "convergence_steps_flattest": 100,
+    "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
+}
+EPISODES = [metric.name for metric in m.METRICS if metric.unit == "episodes"]
+ROW |= dict.fromkeys((f"{name}_censored" for name in EPISODES), 0)
+COLUMNS = list(ROW)
+ENVIRONMENTS, VARIANTS, SEEDS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_full"], [3, 1]
+WANTED = [(*run, 400) for run in product(ENVIRONMENTS, VARIANTS, SEEDS)]
+
+
+def runs():
+    keys = enumerate(product(ENVIRONMENTS, VARIANTS, SEEDS))
+    return {key: frame(noisy(i) - 300 * (key[0] == "Acrobot-v1"), length=7) for i, key in keys}
+
+
+def table(settings=CONFIG):
+    return t.metrics_table(runs(), settings)
+
+
+def test_a_row_holds_each_metric_under_its_name():
+    returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
+    row = t.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    assert row == ROW
+    assert list(row) == COLUMNS
+
+
+def test_the_table_has_every_run_and_counts_censored_ones():
+    result = table()
+    assert list(result[COLUMNS[:4]].itertuples(index=False, name=None)) == WANTED
+    assert not result.isna().any(axis=None)
+    acrobot = result[result["env"] == "Acrobot-v1"]  # the bar is above the final return
+    assert (acrobot[["sample_efficiency", "sample_efficiency_censored"]] == [400, 1]).all(axis=None)
+
+
+def test_betas_are_measured_like_returns(tmp_path):
+    beta = np.linspace(0.2, 0.6, 400)[::-1]
+    found = {run: own.assign(beta=beta) for run, own in runs().items()}
+    result = t.betas_table(found, CONFIG)
+    shown = result[["beta_end", "beta_lowest", "beta_highest"]]
+    assert np.allclose(shown, [beta[-40:].mean(), 0.2, 0.6])
+    for run, correlation in zip(found, result["stagnation_correlation"], strict=True):
+        average = found[run]["extrinsic_return"].rolling(50).mean()
+        stagnation = (average.shift(50) - average).shift(1).round(9)  # ties
+        expected = stagnation.corr(pd.Series(beta), method="spearman")
+        assert correlation == pytest.approx(expected)
+    without = t.betas_table(found, CONFIG.model_copy(update={"reference_return": {}}))
+    pd.testing.assert_frame_equal(without, result.iloc[:, :-2])  # no bar, nothing before it
+    result.to_csv(tmp_path / "betas.csv", index=False)
+    read = read_table(tmp_path / "betas.csv", t.betas_columns(CONFIG))
+    pd.testing.assert_frame_equal(read, result)
+
+
+def change(row, column, value):
+    def damage(lines):
+        cells = lines[row].split(",")
+        cells[COLUMNS.index(column)] = value
+        lines[row] = ",".join(cells)
+
+    return damage
+
+
+DAMAGE = {
+    "a run lost": (lambda lines: lines.pop(3), "line 4: the run .*1, 400. stands where .*3, 400. "),
+    "a run twice": (lambda lines: lines.append(lines[1]), "line 10: the run .* where None belongs"),
+    "rows swapped": (lambda lines: lines.insert(1, lines.pop(2)), "line 2: the run .*1, 400. stan"),
+    "another budget": (change(8, "episodes", "401"), "line 9: the run .*1, 401. stands where"),
+    "a column lost": (lambda lines: lines.__setitem__(0, lines[0][:-9]), "line 1: the column"),
+    "NaN": (change(5, "final_return", "nan"), "line 6: final_return is 'nan'"),
+    "empty": (change(5, "convergence_steps", ""), "line 6: convergence_steps is ''"),
+    "episode 0": (change(5, "sample_efficiency", "0"), "line 6: sample_efficiency is 0 of 400"),
+    "beyond E": (change(2, "sample_efficiency", "401"), "line 3: sample_efficiency is 401 of 400"),
+    "a flag of 2": (change(2, "convergence_steps_censored", "2"), "line 3: convergence_steps"),
+    "a flag too much": (change(2, "sample_efficiency_censored", "1"), "line 3: sample_efficiency"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
+    spoil, named = DAMAGE[damage]
+    path = tmp_path / "metrics.csv"
+    lines = table().to_csv(index=False).splitlines()
+    spoil(lines)
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordError, match=named) as refusal:
+        t.read_metrics(path, WANTED, CONFIG)
+    assert str(path) in str(refusal.value)
+
+
+# metrics of the user's own
+
+
+@pytest.fixture
+def custom(monkeypatch):
+    """`custom(*metrics)`: the settings with these, as if this file were the user's."""
+
+    def make(*metrics):
+        names = [f"OWN_{number}" for number in range(len(metrics))]
+        for name, metric in zip(names, metrics, strict=True):
+            monkeypatch.setattr(sys.modules[__name__], name, metric, raising=False)
+        references = [f"{__name__}:{name}" for name in names]
+        return check(MetricsConfig, SETTINGS | {"custom": references}, "test")
+
+    return make
+
+
+def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
+    settings = custom(
+        m.Metric("positive", "Positive", "episodes", lambda curve: curve.first(curve.returns > 0)),
+        m.Metric("worst", "Worst", "return", lambda curve: curve.returns.min()),
+    )
+    result = table(settings=settings)
+    added = ["positive", "worst", "positive_censored"]
+    assert list(result.columns) == [*COLUMNS[:17], *added[:2], *COLUMNS[17:], added[2]]
+    pd.testing.assert_frame_equal(result[COLUMNS], table())
+    for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
+        returns = run["extrinsic_return"].tolist()
+        first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
+        assert tuple(row) == (first or 400, min(returns), first is None)
+    result.to_csv(tmp_path / "metrics.csv", index=False)
+    read = t.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
+    pd.testing.assert_frame_equal(read, result, check_exact=True)
+    with pytest.raises(RecordError, match="line 1: the column 'positive'"):
+        t.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
+
+
+NOT_FINITE = "is nan, but should be a finite number"
+NO_METRIC = [  # what is given, and what is said of it
+    (3, "is no mace_rl.study.measure.metrics.Metric but of type int"),
+    (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
+    (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
+    (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
+    (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
+    (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
+    (m.Metric("y", "Y", "return", lambda curve: np.nan), NOT_FINITE),
+    (m.Metric("y", "Y", "return", lambda curve: m.Attained(1, False)), "should be a finite number"),
+    (m.Metric("y", "Y", "episodes", lambda curve: 3.5), r"y of the run \(.*, 3\) is 3.5"),
+    (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(0, False)), "y is 0 of 400 episodes"),
+    (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(9, True)), "y is 9 of .*censored = 1"),
+]
+
+
+@pytest.mark.parametrize(("own", "problem"), NO_METRIC)
+def test_what_is_no_metric_is_refused(own, problem, custom):
+    with pytest.raises((ConfigError, RecordError), match=problem):
+        table(settings=custom(m.Metric("x_censored", "X", "return", lambda curve: 0.0), own))
+
+
+def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
+    def names(environments, **changes):
+        settings = check(MetricsConfig, SETTINGS | changes, "test").within(environments, ["ppo"])
+        return [metric.name for metric in m.all_metrics(settings) if metric.needs]
+
+    assert names(ENVIRONMENTS) == ["solved", "sample_efficiency_common"]
+    assert names(["CartPole-v1", "Other-v0"]) == []
+    assert names(ENVIRONMENTS, solved_return={"CartPole-v1": 475.0}) == ["sample_efficiency_common"]
+    assert names(["CartPole-v1"], reference_return={}) == ["solved"]
+    columns = table(settings=CONFIG.within([*ENVIRONMENTS, "Other-v0"], VARIANTS)).columns
+    assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
+    chosen = {"constants": {"learned": "mace_full", "fixed": ["ppo", "beta_1"]}}
+    drawn = check(MetricsConfig, SETTINGS | chosen, "test")
+    lines = drawn.incomplete([*ENVIRONMENTS, "Other-v0"], VARIANTS)
+    assert [line.split()[0].partition(".")[2] for line in lines] == [*GOALS, "constants"]
+    assert [line.split()[-1] for line in lines] == ["Other-v0", "Other-v0", "beta_1"]
+    assert CONFIG.incomplete(ENVIRONMENTS, []) == CONFIG.incomplete(["Other-v0"], []) == []
+    assert drawn.within(ENVIRONMENTS, VARIANTS).constants is None
+    assert drawn.within(ENVIRONMENTS, ["ppo", "beta_1", "mace_full"]).constants == drawn.constants
+
+
+def test_a_goal_that_random_actions_attain_is_refused():
+    settings = check(MetricsConfig, SETTINGS | {"solved_return": {"CartPole-v1": 22.1}}, "test")
+    problem = r"metrics\.solved_return\.CartPole-v1 is 22\.1, but should be greater than .*, 22\.1"
+    with pytest.raises(ConfigError, match=problem):
+        settings.within(ENVIRONMENTS, VARIANTS)

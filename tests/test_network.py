@@ -3,7 +3,7 @@
 import copy
 import math
 from functools import partial
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ import torch
 from shared import LAYER_NORM, laid_out
 
 from mace_rl.agent.custom import custom_module
-from mace_rl.beta.lstm import CompiledMetaNetwork, MetaNetwork
+from mace_rl.beta.lstm import MetaNetwork, lstm_logit, read_network
+from mace_rl.beta.meta import WEIGHTS
 from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled
@@ -19,21 +20,16 @@ from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 
 # --- Compiled networks --------------------------------------------------------------------------
 
-# Compiled form, torch module from a generator, shape of the inputs or shapes of several sequences.
+# Compiled form, torch module from a generator, shape of the inputs.
 CASES = []
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
     CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
 for size in (1, 2, 15):
     CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
-for units, lengths in product((1, 5, 128), ([1], [300], [7, 32, 1, 32, 7])):
-    shapes = [(length, 7) for length in lengths]
-    CASES.append((CompiledMetaNetwork, partial(MetaNetwork, 7, units, 0.4), shapes))
 
 
-def drawn(rng: np.random.Generator, shape) -> np.ndarray | list[np.ndarray]:
-    """Standard normal inputs, float32; of a list of shapes a list."""
-    if isinstance(shape, list):
-        return [drawn(rng, one) for one in shape]
+def drawn(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normal inputs, float32."""
     return rng.standard_normal(shape).astype(np.float32)
 
 
@@ -46,13 +42,10 @@ def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, sh
         for part in module.parameters():
             free = (part != 0) | (part.ndim == 1)  # masked weights stay 0
             part += 0.3 * free * torch.from_numpy(rng.standard_normal(part.shape)).float()
-    several = isinstance(shape, list)
     inputs = drawn(rng, shape)
 
     def answers(module: torch.nn.Module) -> torch.Tensor:
-        kind = next(module.parameters()).dtype
-        parts = inputs if several else [inputs]
-        return torch.cat([module(torch.from_numpy(part).to(kind)) for part in parts])
+        return module(torch.from_numpy(inputs).to(next(module.parameters()).dtype))
 
     double = copy.deepcopy(module).double()
     expected = answers(double)
@@ -62,7 +55,7 @@ def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, sh
     one = compiled(copy.deepcopy(module))
     trace = one.forward(inputs)
     np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
-    one.backward(trace, np.ones_like(trace.outputs))  # β's credit goes back more than once
+    one.backward(trace, np.ones_like(trace.outputs))  # it may go back more than once
     found = one.backward(trace, grad_outputs.astype(np.float32))
     flat = laid_out(one, gradients)
     np.testing.assert_allclose(found, flat, rtol=1e-3, atol=1e-4 * np.abs(flat).max())
@@ -104,24 +97,6 @@ def test_the_forward_pass_of_one_observation_is_that_of_many_to_the_bit(hidden):
         assert (one.forward(row[None]).outputs[0] == outputs).all()
 
 
-@pytest.mark.parametrize("units", [1, 5, 128])
-def test_sequences_together_and_each_alone(units):
-    """Their logits are equal to the bit, whatever is beside them; gradients add up."""
-    rng = np.random.default_rng(0)
-    one = CompiledMetaNetwork(MetaNetwork(7, units, 0.4, rng))
-    one.own()[3][:] = rng.standard_normal(units)  # the readout
-    sequences = drawn(rng, [(length, 7) for length in (7, 32, 1, 32, 7, 12)])
-    weights = drawn(rng, (6,))
-    together = one.forward(sequences)
-    alone = [one.forward([sequence]) for sequence in sequences]
-    assert together.outputs.tolist() == [trace.outputs[0] for trace in alone]
-    assert len(set(together.outputs)) == 6
-    pairs = zip(alone, weights, strict=True)
-    expected = np.sum([one.backward(trace, weight[None]) for trace, weight in pairs], axis=0)
-    found = one.backward(together, weights)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
 @pytest.mark.parametrize("output_gain", [0.01, 1.0])
 def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
@@ -139,24 +114,32 @@ def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
 
 
 @pytest.mark.parametrize("length", [1, 40])
-def test_meta_network_is_pytorch_s_lstm_with_a_readout(length):
-    """PyTorch has the gates as input, forget, candidate, output, and two biases."""
+@pytest.mark.parametrize("units", [1, 5, None])
+def test_meta_network_is_pytorch_s_lstm_with_a_readout(units, length):
+    """With drawn weights, or those that come with the package.
+
+    PyTorch has the gates as input, forget, candidate, output, and two biases.
+    """
     rng = np.random.default_rng(0)
-    module = MetaNetwork(7, 5, 0.4, rng).double()
-    torch.nn.init.normal_(module.readout, generator=torch.Generator().manual_seed(0))
+    if units:
+        shapes = (7, 4 * units), (units, 4 * units), (4 * units,), (units,), (1,)
+        network = MetaNetwork(*(drawn(rng, shape) for shape in shapes))
+    else:
+        network = read_network(WEIGHTS)
+    inputs, size = len(network.weight_ih), len(network.readout)
 
-    def theirs(weights: torch.Tensor) -> torch.Tensor:
-        input_gate, forget_gate, output_gate, candidate = weights.detach().chunk(4, dim=-1)
-        return torch.cat([input_gate, forget_gate, candidate, output_gate], dim=-1).movedim(-1, 0)
+    def theirs(weights: np.ndarray) -> torch.Tensor:
+        parts = torch.from_numpy(weights).double().chunk(4, dim=-1)
+        return torch.cat([parts[gate] for gate in (0, 1, 3, 2)], dim=-1).movedim(-1, 0)
 
-    lstm = torch.nn.LSTM(7, 5, dtype=torch.float64)
-    ours = module.weight_ih, module.weight_hh, module.bias, torch.zeros(20)
+    lstm = torch.nn.LSTM(inputs, size, dtype=torch.float64)
+    ours = network.weight_ih, network.weight_hh, network.bias, np.zeros(4 * size)
     names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     lstm.load_state_dict({name: theirs(part) for name, part in zip(names, ours, strict=True)})
-    sequence = torch.from_numpy(2 * rng.standard_normal((length, 7)))
-    _, (hidden, _) = lstm(sequence)
-    expected = (hidden[0] * module.readout).sum() + module.readout_bias
-    torch.testing.assert_close(module(sequence), expected)
+    sequence = 2 * drawn(rng, (length, inputs))
+    _, (hidden, _) = lstm(torch.from_numpy(sequence).double())
+    expected = network.readout @ hidden[0].detach().numpy() + network.readout_bias
+    assert lstm_logit(sequence, network) == pytest.approx(*expected, rel=1e-5, abs=1e-5)
 
 
 def test_a_permutation_is_uniform_if_the_draws_are():
@@ -209,10 +192,9 @@ def test_modules_that_do_not_fit_are_refused_by_name(run_config, module, argumen
 def test_a_module_of_one_s_own_is_the_same_from_the_same_seed_and_disturbs_nothing(run_config):
     config = run_config(ppo={"network": LAYER_NORM}).ppo
     before = torch.get_rng_state()
-    one, same, other = (
-        TorchNetwork(custom_module(config.network, [16], 5, 3, np.random.default_rng(seed)))
-        for seed in (0, 0, 1)
-    )
+    generators = map(np.random.default_rng, (0, 0, 1))
+    modules = [custom_module(config.network, [16], 5, 3, generator) for generator in generators]
+    one, same, other = map(TorchNetwork, modules)
     assert (one.parameters == same.parameters).all() and (one.parameters != other.parameters).any()
     inputs = drawn(np.random.default_rng(2), (9, 5))
     expected = one.module()(torch.from_numpy(inputs)).detach()

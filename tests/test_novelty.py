@@ -4,10 +4,14 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.distance import cdist
+from shared import Twin
 
+from mace_rl.bonus.density import DensityEstimator
 from mace_rl.bonus.novelty import CountNovelty, DensityNovelty
 from mace_rl.config.bonus import NoveltyConfig
+from mace_rl.numerics.adam import Adam
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.streams import Streams
 
@@ -15,22 +19,11 @@ SIZE = 3
 
 
 def settings(**changes) -> NoveltyConfig:
-    return NoveltyConfig(
-        **{
-            "count_decay": 0.5,
-            "buffer_size": 50,
-            "write_every": 1,
-            "neighbours": [1, 3, 8],
-            "refresh_every": 1,
-            "calibration_states": 32,
-            "knn_weight": 0.7,
-            "density_hidden_units": 16,
-            "density_learning_rate": 0.01,
-            "density_batch_size": 64,
-            "density_steps": 2,
-            **changes,
-        }
-    )
+    small = {"count_decay": 0.5, "buffer_size": 50, "write_every": 1, "neighbours": [1, 3, 8]}
+    small |= {"refresh_every": 1, "calibration_states": 32, "knn_weight": 0.7}
+    density = {"hidden_units": 16, "learning_rate": 0.01, "batch_size": 64, "steps": 2}
+    small |= {f"density_{name}": value for name, value in density.items()}
+    return NoveltyConfig(**small | changes)
 
 
 def make(size=SIZE, **changes) -> DensityNovelty:
@@ -50,15 +43,11 @@ def cluster(count, centre=0.0, scale=1.0, seed=0) -> np.ndarray:
 
 
 def line(*places: float) -> np.ndarray:
-    """States in one dimension."""
     return np.float32(places)[:, None]
 
 
 def one_hot(*states: int) -> np.ndarray:
     return np.eye(4, dtype=np.float32)[list(states)]
-
-
-# --- Counts -------------------------------------------------------------------------------------
 
 
 def test_counts_by_hand():
@@ -72,9 +61,6 @@ def test_counts_by_hand():
     assert novelty.continued(one_hot(0, 2, 2), visits).tolist() == [1 / 3.5, 1 / 3, 1 / 4]
     novelty.observe(one_hot(2, 2))  # 1½, ½, 2 → ¾, ¼, 1
     assert novelty(one_hot(0, 1, 2, 2)).tolist() == [1 / 1.75, 1 / 1.25, 1 / 2, 1 / 3]
-
-
-# --- k-NN and density ---------------------------------------------------------------------------
 
 
 def brute_distances(states, known, skip=0) -> np.ndarray:
@@ -116,22 +102,6 @@ def test_both_parts_equal_brute_force(visited, scale):
     np.testing.assert_allclose(novelty(states), whole, atol=1e-4)
 
 
-def test_observing_trains_the_density_estimator():
-    """Held-out states of the visited distribution become likelier, episode by episode."""
-    novelty = make(buffer_size=3000, density_steps=10)
-    held_out = cluster(500, seed=99)
-    likelihood = []
-    for episode in range(60):
-        observe(novelty, cluster(50, seed=episode))
-        likelihood.append(float(novelty.density.log_prob(novelty.normaliser(held_out)).mean()))
-    entropy = SIZE / 2 * math.log(2 * math.pi * math.e)  # of a standard normal
-    assert likelihood[0] < likelihood[20] < likelihood[-1]
-    assert likelihood[-1] == pytest.approx(-entropy, abs=0.15)
-
-
-# --- The buffer ---------------------------------------------------------------------------------
-
-
 def test_a_full_buffer_takes_what_is_far_for_what_is_redundant():
     """Pairs, ever farther apart: of the closest one goes. 400 draws of 40 find all of them."""
     novelty = make(size=1, buffer_size=40, neighbours=[1], calibration_states=400)
@@ -157,10 +127,8 @@ def test_a_full_buffer_takes_what_is_far_for_what_is_redundant():
     # Nine in ten are less than 1.05 from their neighbour, four are 0.2 or 0.25: what is between has
     # no novelty, and does not come in, however redundant those are.
     between = line(30.9, 189.2, 205.01)
-    assert (
-        novelty.neighbours.nearest(between[:2], 1)[0]
-        > novelty.neighbours.nearest(line(*pairs[2]), 2)[0][:, 1]
-    ).all()
+    nearest = novelty.neighbours.nearest
+    assert (nearest(between[:2], 1)[0] > nearest(line(*pairs[2]), 2)[0][:, 1]).all()
     assert novelty.knn_novelty(between).tolist() == [0, 0, 0]
     assert after(*between.ravel().tolist()) == set()
     # Of several at once the farthest, and then not its like.
@@ -202,9 +170,6 @@ def test_all_is_brought_up_to_date_at_the_first_end_of_an_episode_after_so_many_
             assert same.all() != bool(due)
 
 
-# --- The whole ----------------------------------------------------------------------------------
-
-
 def test_until_more_than_the_neighbours_were_visited_all_is_new():
     novelty = make()  # of 8 neighbours
     assert novelty(cluster(5)).tolist() == [1.0] * 5
@@ -234,3 +199,77 @@ def test_states_that_repeat_exactly_are_known(cells):
     for _ in range(50):
         observe(novelty, grid[rng.integers(len(grid), size=20)])
     assert novelty(grid).mean() < 0.2
+
+
+# --- The density estimator ------------------------------------------------------------------------
+
+
+def arbitrary(size, hidden_units) -> DensityEstimator:
+    generator = np.random.default_rng(0)
+    model = DensityEstimator(size, hidden_units, generator)
+    parameters = model.network.parameters
+    parameters[:] = 0.5 * generator.standard_normal(len(parameters)) * free(model)
+    return model
+
+
+def free(model: DensityEstimator) -> np.ndarray:
+    """Which parameters are neither masked nor zeros added to the layout."""
+    return model.network.mask * Twin(model.network).own()
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 15])
+def test_conditional_of_each_coordinate_depends_on_earlier_ones_only(size):
+    """To the bit: its μ and σ change with those, and with no other."""
+    model = arbitrary(size, hidden_units=32)
+    x = np.random.default_rng(1).standard_normal((1, size)).astype(np.float32)
+    before = model.network.forward(x).outputs[0]
+    for j in range(size):
+        changed = x + np.float32(0.5) * (np.arange(size) == j)
+        same = model.network.forward(changed).outputs[0] == before
+        assert same.tolist() == [i <= j for i in range(size)] * 2
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_log_density_and_gradient_equal_autograd(size, narrow):
+    """Of normal distributions with the network's μ and σ, in double precision.
+
+    Of the first coordinate log σ is the bias alone; if `narrow`, below its bound.
+    """
+    model = arbitrary(size, hidden_units=8)
+    _, biases = model.network.layers(model.network.parameters)[-1]  # of μ, then log σ
+    biases[size] = -5.5 if narrow else -1.0
+    x = np.random.default_rng(1).standard_normal((200, size)).astype(np.float32)
+    twin = Twin(model.network)
+    outputs = twin(x)
+    normal = torch.distributions.Normal(outputs[:, :size], outputs[:, size:].clamp(min=-5).exp())
+    expected = normal.log_prob(torch.from_numpy(x)).sum(dim=1)
+    np.testing.assert_allclose(model.log_prob(x), expected.detach(), rtol=1e-4, atol=1e-5)
+    found, expected = model.gradient(x), twin.gradient(expected.mean()) * free(model)
+    assert found.dtype == np.float32 and (found[free(model) == 0] == 0).all()
+    largest = np.abs(expected).max()
+    assert largest > 0.1
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * largest)
+
+
+def test_training_approaches_the_entropy_of_a_known_gaussian():
+    """Held-out log-likelihood rises to minus the entropy, and not above it."""
+    rng = np.random.default_rng(0)
+    factor = np.array([[1.0, 0, 0], [0.8, 0.6, 0], [-0.5, 0.5, 0.3]])
+    data = (rng.standard_normal((12_000, 3)) @ factor.T + [1, -1, 0]).astype(np.float32)
+    entropy = 1.5 * math.log(2 * math.pi * math.e) + math.log(0.6 * 0.3)
+    train, held_out = data[:10_000], data[10_000:]
+    model = DensityEstimator(3, 64, rng)
+    adam = Adam(model.network.parameters, 0.005)
+    likelihoods = []
+    for step in range(1201):
+        if step in (0, 50, 1200):
+            likelihoods.append(float(model.log_prob(held_out).mean()))
+        adam.step(-model.gradient(train[rng.integers(10_000, size=256)]))
+    # Masked weights stay 0: of the 64 units half may see one input and half two, of three; and two
+    # outputs may see no unit, two one half, and two all.
+    parameters = adam.parameters[Twin(model.network).own()]
+    assert (parameters == 0).sum() == 32 * 2 + 32 + 2 * (64 + 32)
+    assert np.count_nonzero(adam.parameters) == np.count_nonzero(parameters)
+    assert likelihoods[0] < likelihoods[1] < likelihoods[2]
+    assert likelihoods[-1] == pytest.approx(-entropy, abs=0.08)

@@ -56,9 +56,8 @@ def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
     policy = random_policy(space, scale=scale)
     observations, actions = steps(policy)
     outputs, weights = policy.network.outputs(observations), np.linspace(-2, 2, len(actions))
-    leaves = [
-        torch.from_numpy(part).double().requires_grad_() for part in (outputs, policy.log_std)
-    ]
+    parts = outputs, policy.log_std
+    leaves = [torch.from_numpy(part).double().requires_grad_() for part in parts]
     if policy.discrete:
         expected = torch.distributions.Categorical(logits=leaves[0])
     else:
@@ -76,9 +75,6 @@ def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
     np.testing.assert_allclose(grad[:, : outputs.shape[1]], gradients[0], rtol=1e-3, atol=1e-4)
     assert grad.shape == (50, 16) and not grad[:, outputs.shape[1] :].any()
     np.testing.assert_allclose(grad_log_std - 1, gradients[1], rtol=1e-3, atol=1e-3)
-
-
-# --- Acting -------------------------------------------------------------------------------------
 
 
 @both_engines
@@ -132,7 +128,6 @@ def test_box_actions_are_mean_plus_std_times_noise(engine):
 
 @both_spaces
 def test_acting_has_the_bits_of_the_batch(space):
-    """Or an update would begin with ratios that are not 1."""
     policy = random_policy(space, hidden=(64, 64), scale=0.4)
     observations, _ = steps(policy, 100)
     rng = np.random.default_rng(8)

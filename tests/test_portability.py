@@ -1,25 +1,25 @@
-"""The same bytes whatever the process is told of threads, hashes, language and time."""
+"""The same bytes whatever a process is told of threads, hashes, language and time, as before."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
+from invented import CLAIMS
+from shared import ROOT, VARIANTS, finish, provenance_of
 
-from mace_rl import files
+from mace_rl.records import EpisodeRecord, RunKey, as_columns
+from mace_rl.study.compare.summary import split, summary
+from mace_rl.study.config import read_study
+from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.show import curves
+from mace_rl.study.show.latex import table1_latex
 
-STRANGE = {
-    "PYTHONHASHSEED": "12345",
-    "OMP_NUM_THREADS": "2",
-    "OPENBLAS_NUM_THREADS": "2",
-    "LC_ALL": "C",
-    "LANG": "tr_TR.UTF-8",
-    "TZ": "Asia/Kathmandu",
-    "SOURCE_DATE_EPOCH": "1",
-    "MPLBACKEND": "svg",
-}
+STRANGE = {"PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+STRANGE |= {"LC_ALL": "C", "LANG": "tr_TR.UTF-8", "TZ": "Asia/Kathmandu"}
+STRANGE |= {"SOURCE_DATE_EPOCH": "1", "MPLBACKEND": "svg"}
 
 TRAIN = """
 import sys
@@ -32,7 +32,6 @@ run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
 
 
 def start(*command: str, strange: bool) -> None:
-    """A new process, with or without strange settings; its failure is the test's."""
     plain = {name: value for name, value in os.environ.items() if name not in STRANGE}
     environment = plain | (STRANGE if strange else {})
     subprocess.run([sys.executable, *command], env=environment, check=True)
@@ -44,14 +43,53 @@ def test_a_training_is_the_same(run_config, tmp_path: Path, environment: str) ->
     config = run_config(environment, "mace_full", 0, episodes=30).model_dump_json()
     for name in ("plain", "strange"):
         start("-c", TRAIN, config, str(tmp_path / name), strange=name == "strange")
-    one, other = (
-        json.loads((tmp_path / n / files.RECORD).read_text()) for n in ("plain", "strange")
-    )
-    assert one["outputs"] == other["outputs"]
+    one, other = (provenance_of(tmp_path / name)["outputs"] for name in ("plain", "strange"))
+    assert one == other
 
 
 @pytest.mark.slow
 def test_tables_and_figures_are_the_same() -> None:
-    """As tests/test_reduced.py has them, byte for byte."""
-    tests = str(Path(__file__).with_name("test_reduced.py"))
-    start("-m", "pytest", "-q", tests, "-k", "table_1 or figures", strange=True)
+    tests = [f"{__file__}::{name}" for name in ("test_table_1", "test_figures")]
+    start("-m", "pytest", "-q", *tests, strange=True)
+
+
+# --- docs/reduced ---------------------------------------------------------------------------------
+
+EXPECTED = ROOT / "docs" / "reduced"
+STUDY = read_study([ROOT / "config.yaml", ROOT / "config" / "reduced.yaml"])
+METRICS = STUDY.metrics.within(STUDY.environments, STUDY.variants)
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[RunKey, pd.DataFrame]:
+    records = {key: finish(STUDY.run_config(*key)).records for key in STUDY.runs()}
+    return {key: pd.DataFrame(as_columns(EpisodeRecord, own)) for key, own in records.items()}
+
+
+@pytest.mark.slow
+def test_table_1(runs):
+    metrics = metrics_table(runs, METRICS)
+    table, _ = split(summary(metrics, METRICS, CLAIMS.table1), CLAIMS.table1)
+    assert table.to_csv(index=False).encode() == (EXPECTED / "table1.csv").read_bytes()
+    latex = table1_latex(table, STUDY.labels, METRICS, CLAIMS.table1)
+    assert latex.encode() == (EXPECTED / "table1.tex").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", ["1", "2"])
+def test_figures(runs, tmp_path, number):
+    shown, confidence = curves.quantity(number, STUDY.metrics), STUDY.metrics.confidence
+    single = curves.seed_curves(runs, shown)
+    look = curves.PlotStyle(STUDY.figure, confidence, STUDY.labels, STUDY.colours, {})
+    means = curves.mean_curves(single, shown, STUDY.metrics)
+    name = f"figure{number}.png"
+    curves.save_figure(curves.draw_figure(means, single, shown, look), tmp_path / name)
+    assert (tmp_path / name).read_bytes() == (EXPECTED / name).read_bytes()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("environment", STUDY.environments)
+def test_the_first_episodes_do_not_depend_on_the_budget(run_config, environment, variant):
+    short, long = (finish(run_config(environment, variant, 3, episodes=n)) for n in (6, 10))
+    assert short.records == long.records[:6]
+    assert list(map(str, short.diagnostics)) == list(map(str, long.diagnostics[:6]))  # with NaN

@@ -1,4 +1,4 @@
-"""Products, sums and elementary functions: exact chains, the same bits for every processor."""
+"""Products, sums, elementary functions, nearest neighbours: exact, and the same bits everywhere."""
 
 import hashlib
 import os
@@ -16,6 +16,7 @@ from numba.core.registry import cpu_target
 from scipy import special
 
 from mace_rl.numerics import elementary, products
+from mace_rl.numerics.nearest import Neighbours
 
 SIZES = st.integers(1, 13)
 
@@ -142,16 +143,54 @@ def test_bits_do_not_depend_on_what_the_compiler_compiles_for():
     """A whole training with everything in it, beside products by every tile."""
     _, name, features = cpu_target.target_context.codegen().magic_tuple()
     wide = "+avx512f" in features.split(",")
-    found = {}
+    found, command = {}, [sys.executable, "-c", DIGEST]
     for target, having in TARGETS.items():
         if "avx512" in having and not wide:
             continue  # this machine cannot run it
         given = {"NUMBA_CPU_NAME": target, "NUMBA_CPU_FEATURES": having}
-        done = subprocess.run(
-            [sys.executable, "-c", DIGEST], env=os.environ | given, capture_output=True, text=True
-        )
+        done = subprocess.run(command, env=os.environ | given, capture_output=True, text=True)
         found[target] = done.stdout.strip() or done.stderr
-    plain = subprocess.run([sys.executable, "-c", DIGEST], capture_output=True, text=True)
+    plain = subprocess.run(command, capture_output=True, text=True)
     found[name] = plain.stdout.strip()
     assert len(set(found.values())) == 1, found
     assert len(plain.stdout.strip()) == len(hashlib.sha256().hexdigest())
+
+
+# --- Nearest neighbours ---------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    st.integers(0, 2**32),
+    *(st.integers(1, 5), st.integers(1, 400), st.integers(1, 20), st.booleans()),
+)
+def test_the_nearest_are_found_and_equals_in_order(seed, count_of_queries, total, size, on_a_grid):
+    draw = np.random.default_rng(seed)
+    points = draw.standard_normal((total, size)).astype(np.float32)
+    queries = draw.standard_normal((count_of_queries, size)).astype(np.float32)
+    if on_a_grid:  # many at equal distances, some at the same place
+        points, queries = points.round(), queries.round()
+    count = draw.integers(1, total + 1)
+    zero, one = np.zeros(size), np.ones(size)
+    squared_distances, indices = Neighbours(points, zero, one).nearest(queries, count)
+    differences = queries.astype(np.float64)[:, None] - points
+    exact = (differences * differences).sum(axis=2)
+    order = np.argsort(exact, axis=1, kind="stable")[:, :count]
+    expected = np.take_along_axis(exact, order, axis=1)
+    np.testing.assert_allclose(squared_distances, expected, rtol=1e-5, atol=1e-6)
+    if on_a_grid:  # so distances are exact
+        np.testing.assert_array_equal(indices, order)
+    assert all(len(set(row)) == count for row in indices.tolist())
+    for n, row in enumerate(indices):
+        np.testing.assert_allclose(exact[n, row], squared_distances[n], rtol=1e-5, atol=1e-6)
+    single = [Neighbours(points, zero, one).nearest(query[None], count) for query in queries]
+    assert np.array_equal(np.concatenate([distances for distances, _ in single]), squared_distances)
+
+
+def test_what_comes_after_the_candidates_were_cut_down_still_counts():
+    """Three blocks have more points than are asked for; the fourth has one just within reach."""
+    draw = np.random.default_rng(0)
+    places = np.append(draw.permutation(192) + 1.0, [99.5, 1000, 1001])
+    points = places.astype(np.float32)[:, None]
+    _, indices = Neighbours(points, np.zeros(1), np.ones(1)).nearest(np.zeros((1, 1)), 100)
+    assert places[indices[0]].tolist() == [*range(1, 100), 99.5]

@@ -17,7 +17,6 @@ nan = math.nan
 
 
 def told(episode: int, seconds: float, left: float = 60.0, start: float = 30.0) -> dict:
-    """What a run of 100 episodes tells after so many seconds."""
     said = {"episode": episode, "episodes": 100, "recent_return": 21.5, "beta": 0.25}
     said |= {"steps_per_second": 1830.4, "left": left}
     return said | {"seconds": seconds, "start_seconds": start}
@@ -32,9 +31,8 @@ class Folder:
     def add(self, env: str = "A", work: float = 1.0, due: bool = True, old: tuple = (), **said):
         """One more run: its `record`, what it has `told`, whether it is at work (`held`)."""
         seed = len(self.plan["runs"])
-        self.plan["runs"].append(
-            {"env": env, "variant": "ppo", "seed": seed, "work": work, "due": due}
-        )
+        planned = {"env": env, "variant": "ppo", "seed": seed, "work": work, "due": due}
+        self.plan["runs"].append(planned)
         folder = self.results / "runs" / env / "ppo" / f"seed{seed}"
         folder.mkdir(parents=True)
         for name, key in {"run.json": "record", "progress.json": "told"}.items():

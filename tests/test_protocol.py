@@ -3,21 +3,22 @@
 import json
 import re
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from invented import LITERAL, PAPERS, QUESTIONS, ROBUST
+from invented import LITERAL, ROBUST, ROOT
 
 from mace_rl import files
+from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
 from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import CORRELATION
 from tools import kept_runs
 
-[CLAIMED], [ASKED] = PAPERS.families.values(), QUESTIONS.families.values()
-ROOT = Path(__file__).parents[1]
+CONFIRMATION = ROOT / "reference" / "confirmation"
+CLAIMS = parse_claims(CONFIRMATION / "claims.yaml")
+CLAIMED, ASKED = CLAIMS.families.values()
 BARREN = "BarrenRegion-v0"
 PAGE = ROOT / "docs" / "protocol.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -44,14 +45,11 @@ def test_claims_are_measured_as_the_page_says(name: str) -> None:
 
 
 def test_questions_have_the_parts_that_the_page_has() -> None:
-    count = {
-        name: sum(len(part.each(QUESTIONS.table1)) for part in claim.parts[ROBUST])
-        for name, claim in ASKED.claims.items()
-    }
+    parts = [claim.parts[ROBUST] for claim in ASKED.claims.values()]
+    count = [sum(len(part.each(CLAIMS.table1)) for part in own) for own in parts]
     # By its words: five tasks; three; three times five others; four; one and one.
-    assert count == dict(
-        zip(["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", "Q7", "Q8"], [5, 3, 5, 5, 5, 4, 1, 1], strict=True)
-    )
+    assert list(ASKED.claims) == [f"Q{number}" for number in range(1, 9)]
+    assert count == [5, 3, 5, 5, 5, 4, 1, 1]
     assert {name for names in ROWS for name in names.split(", ")} >= set(CLAIMED.claims)
     assert f"{WORTH_MENTIONING:.0%}".replace("%", " %") in TEXT
     assert f"below {LEVEL}" in TEXT and f"fewer than {FEWEST_SEEDS} seeds" in TEXT
@@ -60,7 +58,7 @@ def test_questions_have_the_parts_that_the_page_has() -> None:
 def test_configurations_have_the_runs_that_the_page_has() -> None:
     runs = {}
     for name in ("study", "questions"):
-        study = read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"])
+        study = read_study([ROOT / "config.yaml", CONFIRMATION / f"{name}.yaml"])
         for env, variant, seed in study.runs():
             runs.setdefault(name, {}).setdefault((env, variant), []).append(seed)
     assert all(seeds == list(range(100, 120)) for seeds in runs["study"].values())
@@ -72,9 +70,9 @@ def test_configurations_have_the_runs_that_the_page_has() -> None:
 
 @pytest.mark.slow
 def test_every_run_is_kept_and_came_after_the_page_and_from_one_state_of_the_code() -> None:
-    git = ["git", "-C", str(ROOT)]
-    if subprocess.run([*git, "rev-parse", "--is-shallow-repository"], capture_output=True,
-                      text=True, check=False).stdout.strip() != "false":  # fmt: skip
+    git, told = ["git", "-C", str(ROOT)], {"capture_output": True, "text": True}
+    shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
+    if shallow.stdout.strip() != "false":
         pytest.skip("not a git repository with its whole history")
     records = {
         tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
@@ -86,12 +84,11 @@ def test_every_run_is_kept_and_came_after_the_page_and_from_one_state_of_the_cod
     assert records.keys() == {
         run
         for name in ("study", "questions")
-        for run in read_study([ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml"]).runs()
+        for run in read_study([ROOT / "config.yaml", CONFIRMATION / f"{name}.yaml"]).runs()
     }
     ((commit, dirty),) = {tuple(record["code"].values()) for record in records.values()}
     assert not dirty and len({record["sources"] for record in records.values()}) == 1
-    log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(PAGE)], capture_output=True,
-                         text=True, check=True)  # fmt: skip
+    log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(PAGE)], check=True, **told)
     subprocess.run([*git, "merge-base", "--is-ancestor", log.stdout.strip(), commit], check=True)
 
 

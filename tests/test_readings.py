@@ -40,9 +40,7 @@ def select(table: pd.DataFrame, reading: str, source: str) -> pd.DataFrame:
     return rows.set_index("variant")
 
 
-def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
-    frames: Frames, study: Study
-) -> None:
+def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames, study: Study) -> None:
     table = r.readings(frames, study.metrics, CLAIMS.table1)
     runs = metrics_table(frames, study.metrics)
     rows = select(table, "sample_efficiency_range", r.RUNS)
@@ -66,9 +64,8 @@ def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
     lines = markdown(tables.readings(table, study.metrics)).splitlines()
     (cell,) = [line.split("|")[2] for line in lines if "Sample efficiency (range)" in line]
     assert cell.strip().startswith("**mace_full ")
-    assert [part.strip("* ").split()[0] for part in cell.split(",")] == [
-        *("mace_full", "mace_fixed", "ppo")
-    ]
+    order = [part.strip("* ").split()[0] for part in cell.split(",")]
+    assert order == ["mace_full", "mace_fixed", "ppo"]
     titles = [line.split("|")[1].strip() for line in lines[2:]]
     kinds = ["Sample" if title.startswith("Sample") else "Convergence" for title in titles]
     assert kinds == sorted(kinds, reverse=True) and "the paper's Table 1" in titles[0]
@@ -84,9 +81,7 @@ def test_readings_of_the_runs_of_the_paper_and_of_shuffled_returns(
         ((300.0, 100.0, 100.0), (0.001, np.nan, 0.001), False),  # tied
     ],
 )
-def test_first_for_sure_is_who_is_ahead_of_every_other_beyond_chance(
-    means: tuple[float, ...], p_values: tuple[float, ...], expected: bool
-) -> None:
+def test_first_for_sure_is_who_is_ahead_of_every_other(means, p_values, expected) -> None:
     rows = pd.DataFrame({"variant": ["c", "a", "b"], "mean": means, "p_value": p_values})
     found, sure = r.ranked(rows.assign(rank=rows["mean"].rank(method="min")))
     assert (list(found["variant"]), sure) == (["a", "b", "c"], expected)
@@ -101,9 +96,8 @@ def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None
             if variant == "ppo" or seed < 3:
                 returns[100 + seed :] = 450.0
             frames["CartPole-v1", variant, seed] = records(returns)
-    rows = select(
-        r.readings(frames, study.metrics, CLAIMS.table1), "sample_efficiency_range", r.RUNS
-    )
+    table = r.readings(frames, study.metrics, CLAIMS.table1)
+    rows = select(table, "sample_efficiency_range", r.RUNS)
     assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
     runs = metrics_table(frames, study.metrics).set_index("variant")
     times = {name: runs.loc[name, "sample_efficiency_range"].to_numpy(float) for name in rows.index}
@@ -116,9 +110,8 @@ def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None
 
 
 def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> None:
-    settings = study.metrics.model_copy(
-        update={"random_return": {"Other-v0": 20.0}, "reference_return": {}}
-    )
+    changes = {"random_return": {"Other-v0": 20.0}, "reference_return": {}}
+    settings = study.metrics.model_copy(update=changes)
     other = {("Other-v0", *run[1:]): frame for run, frame in frames.items()}
     table = r.readings(other, settings, CLAIMS.table1)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}

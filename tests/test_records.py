@@ -2,9 +2,11 @@
 
 import hashlib
 import os
+import re
 
 import numpy as np
 import pytest
+from shared import refused
 
 from mace_rl.records import RecordError, read_episodes, write_episodes
 
@@ -43,16 +45,6 @@ def test_doubles_and_integers_come_back_to_the_bit(tmp_path):
         assert frame[name].to_numpy().tobytes() == values.tobytes()
 
 
-def test_a_valid_file_written_by_hand_is_read(tmp_path):
-    path = tmp_path / "episodes.csv"
-    path.write_text(text())
-    frame = read_episodes(path, 3)
-    assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
-    assert frame["terminated"].tolist() == [1, 0, 1]
-    write_episodes(tmp_path / "again.csv", {name: frame[name].to_numpy() for name in frame})
-    assert (tmp_path / "again.csv").read_text() == text()
-
-
 DAMAGE = {  # what the file holds, and what the message must name
     "empty": ("", "line 1", "ends within"),
     "a missing column": (text(header=HEADER[: -len(",terminated")]), "line 1", "terminated"),
@@ -60,7 +52,6 @@ DAMAGE = {  # what the file holds, and what the message must name
     "a blank line": (text([*ROWS, ""]), "line 5", "1 cells"),
     "a gap": (text([ROWS[0], "3,30,20,-19.0,0.0,0.4,0"]), "line 3", "episode is 3"),
     "more episodes": (text([*ROWS, "4,32,1,0.1,0.0,0.0,1"]), "line 5", "4 episodes"),
-    "text": (text([ROWS[0].replace("9.5", "many")]), "line 2", "extrinsic_return is 'many'"),
     "an empty cell": (text([ROWS[0].replace("9.5", "")]), "line 2", "extrinsic_return is ''"),
     "NaN": (text([ROWS[0].replace("9.5", "nan")]), "line 2", "extrinsic_return is 'nan'"),
     "a digit too many": (text([ROWS[0].replace("9.5", "9.50")]), "line 2", "'9.50'"),
@@ -80,18 +71,18 @@ def test_a_damaged_file_is_refused_with_its_line(damage, tmp_path):
     content, line, named = DAMAGE[damage]
     path = tmp_path / "épisodes 1.csv"
     path.write_bytes(content.encode())
-    with pytest.raises(RecordError) as refusal:
+    with refused(RecordError, f"^{path}: {line}.*{re.escape(named)}"):
         read_episodes(path, 3)
-    message = str(refusal.value)
-    assert message.startswith(f"{path}: {line}")
-    assert named in message
-    assert "\n" not in message
 
 
 def test_what_run_json_does_not_describe_is_refused(tmp_path):
     """Plausible, but altered; and where the damage has a line, that is named."""
     path = tmp_path / "e.csv"
     path.write_text(text())
+    frame = read_episodes(path, 3)
+    assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
+    write_episodes(tmp_path / "again.csv", {name: frame[name].to_numpy() for name in frame})
+    assert (tmp_path / "again.csv").read_text() == text()
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     assert read_episodes(path, 3, digest).equals(read_episodes(path, 3))
     path.write_text(text().replace("9.5", "9.75"))
@@ -122,12 +113,11 @@ def test_missing_files_folders_and_other_encodings_are_refused(tmp_path):
         read_episodes(tmp_path / "latin.csv", 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("extrinsic_return", np.nan), ("intrinsic_return", np.inf)]
-)
-def test_what_would_be_refused_is_not_written(name, value, tmp_path):
-    with pytest.raises(RecordError, match=f"line 3: {name} is {value}"):
-        write_episodes(tmp_path / "e.csv", columns() | {name: np.array([1.0, value, 1.0])})
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_would_be_refused_is_not_written(value, tmp_path):
+    with pytest.raises(RecordError, match=f"line 3: extrinsic_return is {value}"):
+        spoilt = columns() | {"extrinsic_return": np.array([1.0, value, 1.0])}
+        write_episodes(tmp_path / "e.csv", spoilt)
     assert list(tmp_path.iterdir()) == []
 
 

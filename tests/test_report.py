@@ -9,12 +9,13 @@ import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import yaml
-from invented import CLAIMS, ENVIRONMENTS, VARIANTS
+from invented import CLAIMS, ENVIRONMENTS, ROOT, VARIANTS
 from PIL import Image
 
 from mace_rl import files
@@ -25,15 +26,13 @@ from mace_rl.study.config import read_study
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import ConstantsConfig
 from mace_rl.study.show.animations import animations
-from mace_rl.study.show.cells import number
 from mace_rl.study.show.curves import PlotStyle
 from mace_rl.study.show.report import Provenance, three_digits
 from mace_rl.study.show.report import page as build
 from mace_rl.study.show.sections import read_data
-from mace_rl.study.show.tables import costs
+from mace_rl.study.show.tables import costs, number
 from tools.tables import RULES
 
-ROOT = Path(__file__).parents[1]
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 SECTIONS = ["verdicts", "learning", "table1", "agents", "beta"]
 SECTIONS += ["ranking", "statistics", "ledger", "costs", "workflow", "configuration"]
@@ -47,9 +46,7 @@ class Page(HTMLParser):
         super().__init__()
         self.elements: list[tuple[str, str, dict[str, str | None]]] = []  # section, tag, attributes
         self.text: dict[str, str] = {}
-        self.section = ""
-        self.in_style = False
-        self.style = ""
+        self.section, self.style, self.in_style = "", "", False
         self.feed(html)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
@@ -70,11 +67,9 @@ class Page(HTMLParser):
             self.text[self.section] = self.text.get(self.section, "") + data
 
     def words(self, section: str) -> str:
-        """The section's text with single spaces."""
         return " ".join(self.text[section].split())
 
     def all(self, section: str, tag: str) -> list[dict[str, str | None]]:
-        """The attributes of each such element."""
         return [found for where, name, found in self.elements if (where, name) == (section, tag)]
 
 
@@ -92,9 +87,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run(study.run_config(env, variant, seed), place)
     command = [sys.executable, "-m", "snakemake", "--snakefile", ROOT / "Snakefile", "--cores", "2"]
     command += ["--allowed-rules", *RULES, "--configfile", "tiny.yaml", "--", "page"]
-    done = subprocess.run(
-        [*command, "results/tables.md"], cwd=folder, capture_output=True, text=True, timeout=600
-    )
+    command += ["results/tables.md"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -102,9 +96,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.skipif(
-    BROWSER is None and "CI" not in os.environ, reason="needs chromium (Debian: apt install)"
-)
+NO_BROWSER = BROWSER is None and "CI" not in os.environ
+
+
+@pytest.mark.skipif(NO_BROWSER, reason="needs chromium (Debian: apt install)")
 def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -> None:
     results = made / "results"
     command = [BROWSER or "chromium", "--headless", "--no-sandbox", "--disable-gpu"]
@@ -192,9 +187,8 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     settings = study.metrics.within(study.environments, study.variants)
     settings = settings.model_copy(update={"constants": chosen})
     runs = [(*key, study.run_config(*key).episodes) for key in study.runs()]
-    data, claims = read_data(
-        {path.stem: path for path in (made / "results").glob("*.csv")}, runs, settings
-    )
+    tables = {path.stem: path for path in (made / "results").glob("*.csv")}
+    data, claims = read_data(tables, runs, settings)
     assert not claims
     data["figure2"] = data["figure2"].head(0)
     records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
@@ -215,21 +209,15 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     assert "β is 0 throughout" in page.words("beta")
 
 
-def test_agents_that_do_the_same_untrained_share_a_film(
-    made: Path, run_config, tmp_path: Path
-) -> None:
+def test_agents_that_do_the_same_untrained_share_a_film(made, run_config, tmp_path) -> None:
     hopper, seed1 = made / "results/runs/HopperBulletEnv-v0", tmp_path / "seed1"
     runs = {("HopperBulletEnv-v0", variant): hopper / variant / "seed0" for variant in VARIANTS}
     labels = {variant: variant.upper() for variant in VARIANTS}
     before, *after = animations(runs, labels, made / "results")[0]["HopperBulletEnv-v0"]
-    assert (before.title, before.variants, before.trained) == (
-        "Before training",
-        tuple(VARIANTS),
-        False,
-    )
-    assert [(one.title, one.variants, one.trained) for one in after] == [
-        (labels[variant], (variant,), True) for variant in VARIANTS
-    ]
+    assert (before.title, before.trained) == ("Before training", False)
+    assert before.variants == tuple(VARIANTS)
+    told = [(one.title, one.variants, one.trained) for one in after]
+    assert told == [(labels[variant], (variant,), True) for variant in VARIANTS]
     shutil.copytree(hopper / "ppo/seed1", seed1)
     runs["HopperBulletEnv-v0", "ppo"] = seed1
     first, second, *_ = animations(runs, labels, tmp_path)[0]["HopperBulletEnv-v0"]
@@ -246,16 +234,13 @@ def test_agents_that_do_the_same_untrained_share_a_film(
 
 
 def test_costs_and_times() -> None:
-    records = [
-        {
-            "config": {"environment": "A-v0", "variant": variant, "seed": seed},
-            "seconds": 10.0**seed * (1 + (variant == "full")),
-            "peak_memory_mb": 300 + seed,
-        }
-        for variant in ("ppo", "full")
-        for seed in range(3)
+    runs = [
+        {"environment": "A-v0", "variant": variant, "seed": seed}
+        for variant, seed in product(("ppo", "full"), range(3))
     ]
-    runs = [record["config"] for record in records]
+    records = [{"config": one, "peak_memory_mb": 300 + one["seed"]} for one in runs]
+    for record, one in zip(records, runs, strict=True):
+        record["seconds"] = 10.0 ** one["seed"] * (1 + (one["variant"] == "full"))
     metrics = pd.DataFrame(runs).rename(columns={"environment": "env"}).assign(env_steps=7000)
     plain, full = costs(records, metrics[::-1], {"ppo": "PPO", "full": "Full"}).to_numpy().tolist()
     assert plain == ["A-v0", "PPO", "3", "21", "10 s", "100 s", "2 min", "302"]

@@ -28,12 +28,10 @@ CLASSIC = ["CartPole-v1", "Acrobot-v1"]
 
 
 def bits(episode: Episode) -> list[tuple]:
-    """All of an episode, types included."""
     return [(value.dtype, value.tobytes()) for value in map(np.asarray, vars(episode).values())]
 
 
 def new_policy(environment: Environment, hidden, rng, log_std=0.0, engine="compiled") -> Policy:
-    """A policy as training starts with it."""
     module = mlp([environment.observation_size, *hidden, environment.action_size], 0.01, rng)
     return Policy(ENGINES[engine](module), environment.action_space, log_std)
 
@@ -65,7 +63,6 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
 
 
 def play(environment: Environment) -> Episode:
-    """An episode of nearly uniform actions."""
     noise = draw_noise(environment, np.random.default_rng(0))
     policy = uniform_policy(environment)
     return rollout_for(environment, policy)(environment, policy, noise)
@@ -74,7 +71,6 @@ def play(environment: Environment) -> Episode:
 @pytest.mark.parametrize("kind", ["erratic", "skilled"])
 @pytest.mark.parametrize("name", CLASSIC)
 def test_both_rollouts_play_the_same_episodes(name, kind):
-    """One after the other on two environments, so that the generators stay together too."""
     one, other = environment_of(name, 1), environment_of(name, 1)
     generators = np.random.default_rng(2), np.random.default_rng(2)
     episodes = []
@@ -117,9 +113,6 @@ def test_compiled_steps_equal_gymnasium_s_anywhere(make, step, actions, spreads)
         assert state.tobytes() == env.state.tobytes()
 
 
-# --- Which rollout ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "attribute", "value"),
     [
@@ -141,7 +134,6 @@ def test_changed_physics_take_the_ordinary_rollout(name, attribute, value):
 
 
 def test_others_take_the_ordinary_rollout(register):
-    """Other environments, a subclass, and policies that are not compiled."""
     plain = environment_of("CartPole-v1")
     assert rollout_for(plain, uniform_policy(plain, engine="torch")) is roll_out
     heavy = register("Heavy-v0", type("HeavyCartPole", (CartPoleEnv,), {}), 500)
@@ -149,9 +141,6 @@ def test_others_take_the_ordinary_rollout(register):
         environment = environment_of(name)
         assert rollout_for(environment, uniform_policy(environment)) is roll_out
         assert fallback_reason(environment) == ""
-
-
-# --- Any environment ----------------------------------------------------------------------------
 
 
 class Corridor(gymnasium.Env):
@@ -228,9 +217,7 @@ def test_noise_is_drawn_up_to_the_time_limit():
     assert (draw_noise(environment_of("Pendulum-v1"), one) == other.normal(size=(200, 1))).all()
 
 
-# --- Environments -------------------------------------------------------------------------------
-
-
+IMAGE = Box(0, 255, (8, 8, 3), np.uint8)
 REPLAYED = [*CLASSIC, "HopperBulletEnv-v0", "Pendulum-v1", "SparseMountainCar-v0", "DeepSea10-v0"]
 REPLAYED += ["FrozenLake8x8Deterministic-v0", "BarrenRegion-v0"]
 
@@ -256,7 +243,7 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
         ({}, None, "has no time limit .*set one"),
         ({}, 10**9, "has a time limit of 1000000000 .*set one of 1 to 1000000"),
         ({"observation_space": MultiBinary(3)}, 10, "multibinary observations.*Discrete ones work"),
-        ({"observation_space": Box(0, 255, (8, 8, 3), np.uint8)}, 10, "image observations, Box"),
+        ({"observation_space": IMAGE}, 10, "image observations, Box"),
         ({"action_space": MultiDiscrete([2, 2])}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, (2, 2))}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, ())}, 10, "Discrete and one-dim"),
@@ -264,14 +251,9 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
         ({"action_space": Box(0, 9, (1,), np.int64)}, 10, "of integers"),
         ({"action_space": Discrete(10**9)}, 10, "has 1000000000 numbers"),
         ({"action_space": Box(-1, 1, (200,))}, 10**6, "time limit is 1000000, not up to 500000"),
-        *(
-            ({"observation_space": Tuple([Dict({"a": part}), Discrete(2)])}, 10, message)
-            for part, message in [
-                (Box(0, 255, (8, 8, 3), np.uint8), "image observations"),
-                (Discrete(10**9), "has 1000000000 numbers"),
-                (Dict({}), "dict observations"),
-            ]
-        ),
+        ({"observation_space": Tuple([Dict(a=IMAGE), Discrete(2)])}, 10, "image observations"),
+        ({"observation_space": Tuple([Dict(a=Discrete(10**9))])}, 10, "has 1000000000 numbers"),
+        ({"observation_space": Tuple([Dict(a=Dict({}))])}, 10, "dict observations"),
         (None, 10, ""),
     ],
 )
@@ -284,8 +266,6 @@ def test_environments_that_do_not_fit_are_refused_by_name(register, spaces, limi
 
 
 class Odd(Bonanza):
-    """Its `method` does something else."""
-
     def __init__(self, method, does):
         super().__init__()
         self.odd = method, does
@@ -300,11 +280,7 @@ class Odd(Bonanza):
 @pytest.mark.parametrize(
     ("method", "does", "message"),
     [
-        (
-            "reset",
-            lambda **_: np.zeros(2),
-            r"'Odd-v0': TypeError: reset gave array\(\[0., 0.\]\), not",
-        ),
+        ("reset", lambda **_: np.zeros(2), r"TypeError: reset gave array\(\[0., 0.\]\), not"),
         ("reset", lambda: None, "'Odd-v0': TypeError: .*unexpected keyword argument 'seed'"),
         ("reset", lambda **_: 1 / 0, r"'Odd-v0': ZeroDivisionError: .*test_rollout.py:\d+"),
         ("np_random", np.random.RandomState(0), "np_random is a RandomState, not a Generator"),

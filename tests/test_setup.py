@@ -33,7 +33,6 @@ esac
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A copy of what set-up reads, in a folder with an awkward name."""
     folder = tmp_path / "a földer with spaces"
     folder.mkdir()
     (tmp_path / "stub").write_text(STUB)
@@ -48,14 +47,9 @@ def make(folder, target="setup", **settings):
     stub, calls = folder.parent / "stub", folder.parent / "calls"
     before = calls.read_text() if calls.exists() else ""
     environment = {"PYTHON": str(stub), "CALLS": str(calls), "MAKEFLAGS": "", "MAKELEVEL": "0"}
-    run = subprocess.run(
-        ["make", "--no-print-directory", target],
-        cwd=folder,
-        env=os.environ | environment | settings,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=60,
-    )
+    how = {"cwd": folder, "env": os.environ | environment | settings, "timeout": 60}
+    command = ["make", "--no-print-directory", target]
+    run = subprocess.run(command, stderr=subprocess.PIPE, text=True, **how)
     after = calls.read_text() if calls.exists() else ""
     return run.returncode, run.stderr, after.removeprefix(before).splitlines()
 
@@ -132,7 +126,6 @@ def without_python(tmp_path, monkeypatch):
 
 
 def fetched(checkout):
-    """Standard output and error of what fetches a Python."""
     command = ["make", "--silent", "fetched"]
     run = subprocess.run(command, cwd=checkout, capture_output=True, text=True, timeout=300)
     return run.stdout.strip(), run.stderr

@@ -19,11 +19,13 @@ from pathlib import Path
 
 import psutil
 import pytest
-from shared import contents
+import yaml
+from shared import ROOT, contents, provenance_of
+from snakemake.cli import parse_args
 
 from mace_rl import files
+from mace_rl.runs import queueing
 
-ROOT = Path(__file__).parents[1]
 # Slurm looks here only: Snakemake's Slurm plugin hands no SLURM_* variables on.
 CONFIGURATION = Path("/etc/slurm/slurm.conf")
 PROGRAMS = "munged slurmctld slurmd sbatch srun squeue scancel scontrol sinfo"
@@ -54,7 +56,6 @@ def unfit() -> str:
 
 
 def ask(*command: str) -> str:
-    """What a command prints."""
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
@@ -88,7 +89,6 @@ PartitionName=test Nodes={name} Default=YES
 
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
-    """Wait until `condition` is true; `TimeoutError` after `PATIENCE` seconds."""
     deadline = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > deadline:
@@ -145,9 +145,8 @@ def cluster(scratch: Path) -> Iterator[None]:
         for command in commands:
             # In sessions of their own, so that Ctrl-C reaches them last.
             with (scratch / f"{command[0]}.log").open("wb") as log:
-                daemons.append(
-                    subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-                )
+                own = {"stdout": log, "stderr": log, "start_new_session": True}
+                daemons.append(subprocess.Popen(command, **own))
             if command[0] == "munged":
                 wait_for((scratch / "munge.socket").exists, "munged to start")
         wait_for(lambda: "idle" in ask("sinfo", "-h", "-o", "%t"), "the cluster's node")
@@ -170,9 +169,8 @@ def snakemake(results: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]
     variables = os.environ | {"MACE_RL_CHECKPOINT_SECONDS": "1"}
     log = results.with_suffix(".log")
     with log.open("wb") as said:
-        process = subprocess.Popen(
-            command, cwd=ROOT, env=variables, stdout=said, stderr=said, start_new_session=True
-        )
+        streams = {"stdout": said, "stderr": said, "start_new_session": True}
+        process = subprocess.Popen(command, cwd=ROOT, env=variables, **streams)
     try:
         yield process
         assert process.wait() == 0, log.read_text(errors="replace")[-3000:]
@@ -220,9 +218,7 @@ def disturb(process: subprocess.Popen[bytes], results: Path) -> dict[str, Path]:
 
 @pytest.mark.slow
 @pytest.mark.slurm
-def test_a_study_on_a_cluster_with_mishaps_is_that_of_one_machine(
-    scratch: Path, cluster: None
-) -> None:
+def test_a_study_on_a_cluster_with_mishaps_is_that_of_one_machine(scratch, cluster) -> None:
     """One training is killed, one entry cancelled, one put back, as a preemption does."""
     here, there = scratch / "local", scratch / "slurm"
     with snakemake(here, "--cores", str(len(os.sched_getaffinity(0)))):
@@ -230,21 +226,65 @@ def test_a_study_on_a_cluster_with_mishaps_is_that_of_one_machine(
     with snakemake(there, *ON_SLURM, "--slurm-logdir", str(scratch / "logs")) as process:
         hit = disturb(process, there)
     assert hit.keys() == {*FIRST, SECOND}
-    records = {
-        path.parent: json.loads(path.read_bytes())
-        for path in there.glob(f"runs/*/*/*/{files.RECORD}")
-    }
+    records = {run: provenance_of(run) for run in there.glob("runs/*/*/*")}
     for how, run in hit.items():
         assert records[run]["interruptions"], f"{how}: not resumed"
+    last = [(one["interruptions"][-1:], one["config"]["episodes"]) for one in records.values()]
     # Done already when their entry ended early: not trained again.
-    assert any(
-        record["interruptions"]
-        and record["interruptions"][-1]["after_episode"] == record["config"]["episodes"]
-        for record in records.values()
-    )
+    assert any(told and told[0]["after_episode"] == episodes for told, episodes in last)
     assert not list(there.rglob(files.CHECKPOINT))
     wanted, found = contents(here), contents(there)
     assert found.keys() == wanted.keys()
     assert [name for name in wanted if found[name] != wanted[name]] == []
     [following] = re.findall(r"NEXT_JOB_ID *= (\d+)", ask("scontrol", "show", "config"))
     print(f"{int(following) - 1} entries of the queue for {len(records)} runs; {len(wanted)} files")
+
+
+# --- The profile ----------------------------------------------------------------------------------
+
+PROFILE = ROOT / "profiles" / "slurm" / "config.yaml"
+
+
+def test_snakemake_knows_every_key_of_the_profile() -> None:
+    _, arguments = parse_args(["--workflow-profile", str(PROFILE), "all"])
+    assert arguments.executor == "slurm"
+    assert arguments.retries == 3 and arguments.cores == 1 and arguments.slurm_requeue
+    sizes = arguments.group_components
+    assert sizes == {f"runs_{size}": size for size in sizes.values()}
+
+
+def test_the_profile_has_all_of_the_default_one() -> None:
+    default = yaml.safe_load((ROOT / "profiles" / "default" / "config.yaml").read_text())
+    slurm = yaml.safe_load(PROFILE.read_text())
+    # What is computed is of one machine: as many jobs as it has cores.
+    wanted = {key: value for key, value in default.items() if not key.startswith(("__", "?"))}
+    assert "rerun-triggers" in wanted
+    assert {key: slurm.get(key) for key in wanted} == wanted
+
+
+def test_minutes_grow_with_the_work(run_config) -> None:
+    compiled, other = run_config("CartPole-v1"), run_config("HopperBulletEnv-v0")
+    assert queueing.minutes(compiled, 0.0) == 2
+    assert queueing.minutes(compiled, 30_000 * 60 * 5) == 7
+    assert queueing.minutes(other, 3_000 * 60 * 5) == 7
+    assert queueing.minutes(run_config("CartPole-v1", engine="torch"), 300 * 60 * 5) == 7
+
+
+@pytest.mark.parametrize(
+    ("minutes", "expected"), [(1, "b"), (12, "b"), (13, "a"), (60, "a"), (61, None), (9999, None)]
+)
+def test_an_entry_holds_as_many_runs_as_two_hours_do(minutes: int, expected: str | None) -> None:
+    assert queueing.entry(minutes, {"a": 2, "b": 10}) == expected
+    assert queueing.entry(minutes, {}) is None
+
+
+@pytest.mark.slow
+def test_a_thousand_short_runs_are_some_dozen_entries() -> None:
+    command = [sys.executable, "-m", "snakemake", "-n", "all", "--workflow-profile", str(PROFILE)]
+    command += ["--config", "environments=[CartPole-v1]", f"seeds={[*range(334)]}".replace(" ", "")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    runs = re.findall(r"^ +rule train:$", done.stdout + done.stderr, re.MULTILINE)
+    entries = re.findall(r"Group job runs_(\d+) ", done.stdout + done.stderr)
+    # 334 runs of PPO, 40 to an entry, and 668 with a bonus, 20 to an entry.
+    assert len(runs) == 1002
+    assert sorted(entries) == ["20"] * 34 + ["40"] * 9

@@ -1,5 +1,6 @@
-"""Statistics against hand calculations, exhaustive enumeration and scipy."""
+"""Statistics, comparisons and scores: by hand, by enumeration, by loops and scipy."""
 
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -7,11 +8,16 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from invented import expanded
+from invented import SEEDS, STUDY, expanded, table_for_scores, table_for_tables
 
+from mace_rl.study.compare import aggregate as a
 from mace_rl.study.compare import statistics as s
+from mace_rl.study.compare.comparisons import comparisons
+from mace_rl.study.config import Study
+from mace_rl.study.measure.metrics import all_metrics
 
 REPETITIONS = 5000
+HOW = 0.95, REPETITIONS
 FIVE = np.array([186.0, 201.0, 249.0, 140.0, 120.0])
 OTHER = np.array([170.0, 230.0, 249.0, 150.0, 95.0])
 TWELVE = np.array([3.0, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5, 8])
@@ -20,9 +26,6 @@ NEVER = np.inf
 
 def generator(seed=0):
     return np.random.default_rng(seed)
-
-
-HOW = 0.95, REPETITIONS
 
 
 def interval(values, seed=0):
@@ -142,17 +145,13 @@ def test_probability_of_improvement_at_its_limits(x, y, expected):
 
 @given(st.lists(st.floats(0, 1), max_size=8))
 def test_holm_against_a_loop(p):
-    # By hand: 0.005 · 4, 0.01 · 3, 0.03 · 2, 0.04 · 1 = 0.02, 0.03, 0.06, then at least 0.06.
-    np.testing.assert_allclose(s.holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
     ordered, m = sorted(p), len(p)
-    expected = [
-        max(min(1, ordered[i] * (m - i)) for i in range(m) if ordered[i] <= value) for value in p
-    ]
+    scaled = [(p_value, min(1, p_value * (m - i))) for i, p_value in enumerate(ordered)]
+    expected = [max(one for smaller, one in scaled if smaller <= value) for value in p]
     assert s.holm(p).tolist() == pytest.approx(expected)
 
 
 def observed_minus_expected(x, y):
-    """The log-rank statistic of x, event by event."""
     everything, result = [*x, *y], 0.0
     for time in sorted({time for time in everything if time < NEVER}):
         at_risk = sum(t >= time for t in everything)
@@ -182,9 +181,137 @@ def test_logrank_of_many_runs_is_near_scipys_approximation():
     for shift in (0, 40, 80):
         x, y = draws.exponential(100, 40), shift + draws.exponential(100, 40)
         seen = [np.where(values < 200, values, NEVER) for values in (x, y)]
-        censored = [
-            scipy.stats.CensoredData.right_censored(np.minimum(v, 200), v == NEVER) for v in seen
-        ]
+        right_censored = scipy.stats.CensoredData.right_censored
+        censored = [right_censored(np.minimum(v, 200), v == NEVER) for v in seen]
         expected = scipy.stats.logrank(*censored).pvalue
         assert s.logrank(*seen, 9999, generator()) == pytest.approx(expected, abs=0.02)
     assert np.isnan(s.logrank(x[:1], y[:1], 999, generator()))
+
+
+# --- Comparisons and scores -----------------------------------------------------------------------
+
+FEW = {"bootstrap_repetitions": 1000, "bootstrap_seed": 0}
+SETTINGS = STUDY.metrics.model_copy(update=FEW)
+METRICS = all_metrics(SETTINGS)
+metrics = partial(table_for_tables, METRICS)
+UNITS = {metric.name: metric.unit for metric in METRICS}
+COMPARED = 0.95, 1000
+
+
+def test_which_pairs_are_compared_where():
+    frame = comparisons(metrics(variants=["ppo", "mace_full"]), SETTINGS)
+    assert set(zip(frame["variant"], frame["baseline"], strict=True)) == {("mace_full", "ppo")}
+    frame = comparisons(metrics(variants=["ppo"]), SETTINGS)
+    assert frame.empty and "p_holm" in frame
+    alone = comparisons(metrics(["CartPole-v1"]), SETTINGS)  # not repeated as all environments
+    assert set(alone["env"]) == {"CartPole-v1"}
+    frame = comparisons(metrics(seeds=1), SETTINGS)  # has differences and no p values
+    assert frame[["low", "high", "p_value", "p_holm", "probability_low"]].isna().all(axis=None)
+    assert frame["probability"].notna().all()
+    assert frame.loc[frame["env"] != "all", "difference"].notna().all()
+
+
+def test_comparisons_of_pairs():
+    """Each is what the statistics above say of the seeds' pairs."""
+    returns = {"ppo": range(9), "mace_fixed": range(40, 58, 2), "mace_full": [4] * 9}
+    frame = metrics(["CartPole-v1", "Acrobot-v1"], seeds=9, final_return=returns)
+    shuffled = frame.sample(frac=1, random_state=0)  # pairs are those of a seed, in any order
+    result = comparisons(shuffled, SETTINGS)
+    assert len(result) == 3 * len(METRICS) * 3
+    together = result[result["env"] == "all"]
+    result = result.drop(together.index)
+    for row in result.itertuples():
+        runs = frame[frame["env"] == row.env].set_index("variant")[row.metric]
+        x, y = (runs[name].to_numpy(float) for name in (row.variant, row.baseline))
+        expected = s.paired_comparison(x - y, *COMPARED, generator())
+        assert (row.difference, row.low, row.high) == pytest.approx(expected[:3])
+        if UNITS[row.metric] == "episodes":
+            p_value = s.logrank(x, y, COMPARED[1], generator())
+            assert (row.test, row.p_value) == ("log-rank", p_value)
+            x, y = -x, -y
+        else:
+            assert (row.test, row.p_value) == ("sign-flip", expected.p_value)
+        assert row.probability == pytest.approx(scipy.stats.mannwhitneyu(x, y).statistic / 81)
+        assert row.probability_low <= row.probability <= row.probability_high
+        assert (row.seeds, row.censored) == (9, 0)
+    assert result["p_holm"].tolist() == pytest.approx(s.holm(result["p_value"].tolist()).tolist())
+    # Over the environments together: the mean probability.
+    untested = ["difference", "low", "high", "p_value", "p_holm"]
+    assert together[untested].isna().all(axis=None)
+    row = together.iloc[0]  # final_return of mace_fixed and ppo
+    runs = [frame[frame["env"] == name].set_index("variant") for name in frame["env"].unique()]
+    pairs = [
+        [one.loc[name, [row["metric"]]].to_numpy() for name in (row["variant"], row["baseline"])]
+        for one in runs
+    ]
+    expected = s.probability_of_improvement(pairs, *COMPARED, generator())
+    assert tuple(row[["probability", "probability_low", "probability_high"]]) == expected
+
+
+def kaplan_meier_mean(values, flags, end):
+    """∫₀ᴱ S(t) dt by scipy's estimate of S."""
+    sample = scipy.stats.CensoredData.right_censored(values, flags)
+    survival = scipy.stats.ecdf(sample).sf
+    steps = np.r_[0, survival.quantiles[survival.quantiles < end], end]
+    return float(np.sum(np.diff(steps) * np.r_[1, survival.evaluate(steps[1:-1])]))
+
+
+@pytest.mark.parametrize("budgets", [(2000, 2000), (2000, 1000)], ids=["one budget", "two"])
+def test_censoring_is_respected(budgets):
+    ends = dict(zip(("mace_full", "ppo"), budgets, strict=True))
+    times = {
+        "mace_full": [900, 950, 1300, 1800, 2000, 2000, 100, 2000],
+        "ppo": [700, 980, 990, ends["ppo"], ends["ppo"], 300, ends["ppo"], 400],
+    }
+    flags = {"mace_full": [0, 0, 0, 0, 0, 1, 0, 1], "ppo": [0, 0, 0, 1, 1, 0, 1, 0]}
+    values = {"sample_efficiency": times, "sample_efficiency_censored": flags}
+    values["episodes"] = {name: [ends[name]] * 8 for name in ends}
+    frame = metrics(["CartPole-v1"], list(times), seeds=8, **values)
+    result = comparisons(frame, SETTINGS).set_index("metric").loc["sample_efficiency"]
+    end, restricted, events = min(budgets), {}, {}
+    for name in times:
+        late = np.array(flags[name], bool) | (np.array(times[name]) > end)
+        restricted[name] = kaplan_meier_mean(np.minimum(times[name], end), late, end)
+        events[name] = np.where(late, np.inf, times[name])
+    assert result["difference"] == pytest.approx(restricted["mace_full"] - restricted["ppo"])
+    assert result["low"] < result["difference"] < result["high"]
+    p_value = s.logrank(events["mace_full"], events["ppo"], COMPARED[1], generator())
+    assert (result["test"], result["p_value"]) == ("log-rank", p_value)
+    assert result["censored"] == sum(np.isinf(values).sum() for values in events.values())
+
+
+def test_aggregate_against_a_loop(study: Study):
+    """Scores between random (0) and the best run (1), resampled within environments."""
+    frame = table_for_scores(SEEDS)
+    score = a.scores(frame, study.metrics)
+    for (env, metric), own in score.groupby(["env", "metric"]):
+        returns = frame.loc[frame["env"] == env, metric]
+        random = study.metrics.random_return_in(env)
+        expected = (returns - random) / (returns.max() - random)
+        assert own["score"].tolist() == pytest.approx(expected.tolist())
+    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])
+    runs = score[(score["metric"] == "final_return") & (score["variant"] == "ppo")]
+    row = found.loc["final_return", "ppo"]
+    assert (row["runs"], row["mean"]) == (22, pytest.approx(runs["score"].mean()))
+    assert row["iqm"] == pytest.approx(runs["score"].sort_values().iloc[5:17].mean())
+    draws, resampled = np.random.default_rng(9), []
+    strata = [group["score"].to_numpy() for _, group in runs.groupby("env")]
+    for _ in range(4000):
+        drawn = np.concatenate([draws.choice(values, len(values)) for values in strata])
+        resampled.append(np.mean(np.sort(drawn)[5:17]))
+    expected = expanded(resampled, 10)
+    bounds = [row["iqm_low"], row["iqm_high"]]
+    np.testing.assert_allclose(bounds, expected, atol=0.1 * np.ptp(expected))
+
+
+def test_nobody_better_than_random_counts_as_zero_and_one_seed_has_no_interval(study: Study):
+    frame = table_for_scores(SEEDS)
+    hopper = frame["env"] == "HopperBulletEnv-v0"
+    frame.loc[hopper, list(a.SCORED)] = -3.0
+    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])["mean"]
+    other = a.scores(frame[~hopper], study.metrics)
+    for key, runs in other.groupby(["metric", "variant"]):
+        assert found[key] == pytest.approx(runs["score"].sum() / 22)
+    one = a.aggregate(table_for_scores({"CartPole-v1": 1}), study.metrics)
+    assert one["mean"].notna().all()
+    assert one[["mean_low", "mean_high", "iqm_low", "iqm_high"]].isna().all(axis=None)

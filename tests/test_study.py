@@ -14,6 +14,7 @@ import pytest
 import yaml
 from matplotlib.colors import to_hex
 from matplotlib.ft2font import FT2Font
+from shared import refused
 
 from mace_rl.config.reading import _read, read_options, read_yaml
 from mace_rl.config.run import RunConfig
@@ -47,42 +48,29 @@ training: {ppo: {clpi: 0.2}}  # training, 'ppo.clpi', 0.2, 'clip'
 environment_settings: {Acrobot-v1: {episode: 1}}  # settings.Acrobot-v1, 'episode', 'episodes'
 variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capcity', 7, 'capacity'
 metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'mace_full'
-variant_settings: {mace_full: {beta: {flor: 0}}}  # variant_settings.mace_full, 'beta.flor'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
 variant_settings: {mace_fixed: {beta: {initial: DELETE}}}  # mace_fixed, 'beta.initial', missing
-metrics: {treshold: 0.5}  # 'metrics.treshold', 'threshold'
 metrics: {confidence: 95}  # metrics.confidence, 95, less than 1
-metrics: {final_fraction: 0}  # metrics.final_fraction, 0, greater than 0
-metrics: {moving_average: 50.5}  # metrics.moving_average, 50.5
-metrics: {convergence_slope: 1.0}  # metrics.convergence_slope, 1.0, less than 1
 metrics: {bootstrap_repetitions: 99}  # metrics.bootstrap_repetitions, 99, 100
 metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-v1, nan, finite
-metrics: {random_return: {CartPole-v1: "22"}}  # metrics.random_return.CartPole-v1, '22', number
 metrics: {constants: {learned: mace_full, fixed: []}}  # metrics.constants.fixed, [], 1 item
 metrics: {constants: {learned: ppo, fixed: [ppo]}}  # metrics, constants.fixed, learned, 'ppo'
-figure: {columns: 0}  # figure.columns, 0, greater than
-figure: {colums: 2}  # 'figure.colums', 'columns'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing
 training: {ppo: {clip: high}}  # training, ppo.clip, 'high', number
 training: {ppo: {actor_learning_rate: '3e-4'}}  # ppo.actor_learning_rate, '3e-4', write 0.0003
 environment_settings: {Acrobot-v1: {episodes: '60'}}  # Acrobot-v1, episodes, '60', write 60
-training: {episodes: 10.5}  # episodes, 10.5, integer
 training: {episodes: 1e3}  # episodes, 1000.0, integer (write 1000)
 training: {episodes: 1_000}  # episodes, '1_000', write 1000
 training: {ppo: {scale_rewards: no}}  # ppo.scale_rewards, 'no', write true or false
 training: {episodes: true}  # episodes, True, integer
-training: {episodes: -5}  # training, episodes, -5, greater than 0
 training: {ppo: {clip: .nan}}  # ppo.clip, nan, finite
 training: {memory: {capacity: 5}}  # memory, neighbours, capacity
 training: {engine: jax}  # engine, 'jax', 'torch'
 training: {novelty: {kind: custom}}  # training, novelty, estimator, kind
-training: {meta: DELETE}  # 'meta', missing
 training: null  # training, None, dictionary
 training: {environment: CartPole-v1}  # training.environment, 'CartPole-v1', environments
-training: {ppo: {network: {kind: cnn}}}  # ppo.network, cnn, 'mlp'
 training: {ppo: {network: {kind: torch}}}  # ppo.network, module, missing
-training: {ppo: {network: {kind: torch, module: a:b, sze: 3}}}  # 'ppo.network.sze', 'module'
 training: {ppo: {network: {kind: torch, module: net}}}  # module, 'net', package.module:Name
 training: {ppo: {network: {kind: torch, module: no_such:thing}}}  # network.module, no_such:thing
 variant_settings: {x: {beta: {kind: custom, rule: no_such:Rule}}}  # x, beta.rule, 'no_such:Rule'
@@ -96,7 +84,6 @@ environment_settings: {CliffWalking-v1: {max_episode_steps: 0}}  # CliffWalking-
 environments: [LunarLander-v3]  # environment, 'LunarLander-v3', installed
 environments: [phys2d/CartPole-v1]  # environment, 'phys2d/CartPole-v1', installed
 environments: [a/b/CartPole-v1]  # environment, 'a/b/CartPole-v1', a namespace and '/'
-environments: [phys2d+CartPole-v1]  # environment, 'phys2d+CartPole-v1', letters
 environments: [../x]  # '../x', letters
 environments: [MountainCar-v0]  # metrics.random_return.MountainCar-v0, missing
 environments: [CartPole-v1, CartPole-v1]  # environments, 'CartPole-v1' should be there once
@@ -105,54 +92,59 @@ variants: [ppo, mace_ful]  # variants, 'mace_ful', 'mace_full'
 variant_settings: {'{seed}': {beta: {kind: none}}}  # variant_settings, '{seed}', letters
 variant_settings: {'': {beta: {kind: none}}}  # variant_settings, '', letters
 variant_settings: {LONG: {beta: {kind: none}}}  # variant_settings, 'xxx, up to 200
-variant_settings: {0.1: {beta: {kind: none}}}  # variant_settings.0.1, text, quotes
 variants: [ppo, True]  # variants.1, True, text, quotes
 variant_settings: {mace_ful: {label: x}}  # variant_settings.mace_ful, beta, missing
 variant_settings: {ppo: {label: 3}}  # ppo.label, 3
 variant_settings: {ppo: {label: a}, mace_full: {label: a}}  # 2, label 'a', own
 variant_settings: {ppo: {label: _plain}}  # variant_settings.ppo.label, '_plain', without '_'
 variant_settings: {ppo: {label: "a\\nb"}}  # variant_settings.ppo.label, 'a\\nb', one line
-variant_settings: {ppo: {label: אב}}  # variant_settings.ppo.label, 'אב', Latin
-variant_settings: {ppo: {label: 🎉}}  # variant_settings.ppo.label, '🎉', Latin
 variant_settings: {ppo: {label: LONG}}  # variant_settings.ppo.label, 'xxx, 1 to 60
 variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluish', tab:blue
 variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
 variant_settings: {mace_fixed: {meta: {}}}  # mace_fixed, 'meta', 'exponential' does not use
 variant_settings: {ppo: {seed: 3}}  # variant_settings.ppo.seed, 3, seeds
+variant_settings: {x: {beta: BETA, bonus: {kind: rnb}}}  # settings.x, bonus is {'kind': 'rnb'}
+variant_settings: {x: {beta: BETA, bonus: {kind: rnd}}}  # and extras/ has this one, kind: custom
+variant_settings: {x: {beta: BETA, bonus: {kind: curiosity, relevant: 3}}}  # 'bonus.relevant', 3
+variant_settings: {x: {beta: BETA, bonus: {kind: curiosity, relevance: 1}}}  # relevance, boolean
+variant_settings: {x: {beta: BETA, bonus: {kind: custom}}}  # 'bonus.estimator' is missing
+variant_settings: {x: {beta: BETA, bonus: {kind: custom, estimator: n:N}}}  # estimator has 'n:N'
+variant_settings: {x: {beta: BETA, bonus: null}}  # the section 'bonus' is missing
+variant_settings: {x: {beta: BETA, bonus: OWN, memory: {capacity: 9}}}  # 'memory', kind 'custom'
+variant_settings: {x: {beta: BETA, bonus: BARE, memory: {capacity: 9}}}  # 'memory', bonus.relevance
 seeds: [0, 1, 0]  # seeds, [0, 1, 0], 0 should be there once
-seeds: 3  # seeds, 3, list
 seeds: [-1]  # seeds.0, -1, 0
 seeds: [4294967296]  # seeds.0, 4294967296
 environment_seeds: {HopperBulletEnvv0: [3]}  # environment_seeds, 'HopperBulletEnvv0', nearest
 metrics: {random_return: {CartPole-1: 4.0}}  # metrics.random_return, 'CartPole-1', 'CartPole-v1'
-metrics: {reference_return: {CartPole-1: 4.0}}  # reference_return, 'CartPole-1', 'CartPole-v1'
-results: 5  # results, 5, string
 results: 2024.10  # results, 2024.1, text, quotes
 results: LONG  # results, 'xxx, at most 255
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
 results: CONFIG/x  # results, CONFIG, is a file
 training: {memory: {capacity: 1000000000000}}  # memory.capacity, less than or equal to 10000000
-training: {ppo: {hidden_units: [1000000]}}  # ppo.hidden_units, less than or equal to 10000
 """
+
+
+WORDS = {"CONFIG": str(CONFIG), "LONG": 256 * "x", "BETA": "{kind: constant, value: 1.0}"}
+WORDS |= {"OWN": "{kind: custom, estimator: 'test_extras:Fixed'}"}
+WORDS |= {"BARE": "{kind: curiosity, relevance: false}"}
 
 
 @pytest.mark.parametrize("line", MISTAKES.strip().splitlines())
 def test_mistake_is_named_in_one_line(line: str) -> None:
-    line = line.replace("CONFIG", str(CONFIG)).replace("LONG", 256 * "x")
+    for name, text in WORDS.items():
+        line = line.replace(name, text)
     change, _, expected = line.partition("  # ")
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, "^some.yaml: ") as caught:
         load_study(changed(_read(change, "here")), "some.yaml")
-    message = str(caught.value)
-    assert message.startswith("some.yaml: ")
-    assert "\n" not in message
-    for fragment in expected.split(", "):
-        assert fragment in message.removeprefix("some.yaml: ")
+    message = str(caught.value).removeprefix("some.yaml: ")
+    assert [fragment for fragment in expected.split(", ") if fragment not in message] == []
 
 
 LAYERS = """
 training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}, beta: {kind: constant, value: 0.4}}
-environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {hidden_units: 2}}}
+environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {horizon: 2}}}
 variant_settings: {mace_full: {episodes: 3, ppo: {discount: 0.3}}}
 """
 
@@ -169,7 +161,7 @@ def test_settings_go_over_one_another_in_order() -> None:
     both = study.run_config("CartPole-v1", "mace_full", 0)
     assert (both.episodes, both.ppo.clip, both.ppo.discount) == (3, 0.2, 0.3)
     assert (both.environment, both.variant) == ("CartPole-v1", "mace_full")
-    assert both.meta.hidden_units == 2
+    assert both.meta.horizon == 2
 
 
 SECTIONS = {"memory", "novelty", "meta"}
@@ -181,11 +173,9 @@ SECTIONS = {"memory", "novelty", "meta"}
 )
 def test_a_run_holds_the_sections_that_its_variant_uses(variant: str, used: set[str]) -> None:
     """So that a change of the others leaves its settings, and with them its runs, alone."""
-    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"hidden_units": 7}}
-    plain, other = (
-        load_study(changed({"training": training}), "test").run_config("CartPole-v1", variant, 0)
-        for training in ({}, over)
-    )
+    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"horizon": 7}}
+    studies = [load_study(changed({"training": one}), "test") for one in ({}, over)]
+    plain, other = (study.run_config("CartPole-v1", variant, 0) for study in studies)
     assert SECTIONS & set(plain.settings()) == used
     assert {key for key in SECTIONS if getattr(plain, key) is not None} == used
     settings, others = plain.settings(), other.settings()
@@ -220,7 +210,6 @@ def test_files_are_read_over_one_another(tmp_path: Path) -> None:
 
 
 def laughs(form: str) -> bytes:
-    """Ten times ten times ten … values, in so many words."""
     tens = (", ".join([f"*x{i}"] * 10) for i in range(8))
     rest = (f"x{i}: &x{i} " + form.format(ten) for i, ten in enumerate(tens, 1))
     return "\n".join(["x0: &x0 {a: 1}", *rest]).encode()
@@ -263,10 +252,8 @@ def test_files_that_cannot_be_used(tmp_path: Path, text: bytes | None, expected:
     file = tmp_path / "file.yaml"
     if text is not None:
         file.write_bytes(text)
-    with pytest.raises(ConfigError, match=expected) as caught:
+    with refused(ConfigError, f"^{file}.*{expected}"):
         read_yaml(file)
-    assert str(caught.value).startswith(str(file))
-    assert "\n" not in str(caught.value)
 
 
 TEXTS = ["2024_11_25", "2024-11-25", "12:30", "~/x", "NA", "None", "no", "y", "007", "0o17", "0x1F"]
@@ -287,7 +274,6 @@ TEXTS = ["2024_11_25", "2024-11-25", "12:30", "~/x", "NA", "None", "no", "y", "0
     ],
 )
 def test_a_value_is_what_was_typed(tmp_path: Path, given: str, expected: Any) -> None:
-    """On the command line as in a file."""
     assert read_options([f"key={given}"]) == {"key": expected}
     (tmp_path / "file.yaml").write_text(f"key: {given}", encoding="utf-8")
     assert read_yaml(tmp_path / "file.yaml") == {"key": expected}
@@ -315,13 +301,23 @@ def test_every_variant_has_a_colour_of_its_own() -> None:
     assert colours[:2] == ["tab:brown", "tab:pink"]  # those before are others'
 
 
-def test_planning_imports_nothing_slow() -> None:
-    """Whatever of this project the rules import."""
+HEAVY = {"torch", "numba", "snakemake", "pybullet"}
+PLANNED = {"torch", "numba", "pybullet", "pandas", "scipy.stats", "matplotlib.figure", "seaborn"}
+
+
+@pytest.mark.parametrize(
+    ("code", "forbidden", "backend"),
+    [
+        (None, PLANNED, "of a notebook"),  # whatever of this project the rules import
+        ("import mace_rl.study.show.tables", HEAVY | {"gymnasium"}, "agg"),
+        ("import mace_rl.study.compare.comparisons", HEAVY | {"gymnasium"}, "agg"),
+    ],
+)
+def test_planning_and_tabulating_import_nothing_slow(code, forbidden, backend) -> None:
     rules = [line for rule in RULES.glob("*.smk") for line in rule.read_text("utf-8").splitlines()]
-    code = [line for line in rules if line.startswith(("from ", "import ")) and "mace_rl" in line]
-    code = "\n".join([*code, "import matplotlib.colors, sys; print(*sys.modules)"])
-    command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": "of a notebook"}
+    planning = [line for line in rules if re.match("(from|import) mace_rl", line)]
+    code = "\n".join([code or "\n".join(planning), "import sys; print(*sys.modules)"])
+    command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": backend}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
-    assert "mace_rl.study.config" in loaded
-    assert not loaded & {"torch", "numba", "pandas", "scipy.stats", "matplotlib.pyplot", "pybullet"}
+    assert "mace_rl.study.metrics_config" in loaded and not loaded & forbidden

@@ -36,20 +36,19 @@ from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
-from mace_rl.study.show.cells import Cell, Value, estimate, number
 from mace_rl.study.show.latex import escaped, latex_cell, table1_latex, table2_latex
 from mace_rl.study.show.markdown import markdown, plain
 from mace_rl.study.show.markdown import page as markdown_page
 from mace_rl.study.show.report import as_html
 from mace_rl.study.show.sections import of_ledger, of_runs, read_data
+from mace_rl.study.show.tables import Cell, Value, estimate, number
 
 SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
 metrics = partial(table_for_tables, all_metrics(SETTINGS))
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
 WORST = Metric("worst", "Worst & last", "return", lambda curve: curve.returns.min())
-PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(
-    update={"entropy_coefficient": 1e-05, "hidden_units": [64, 32], "gae_lambda": 1.0}
-)
+SHOWN = {"entropy_coefficient": 1e-05, "hidden_units": [64, 32], "gae_lambda": 1.0}
+PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(update=SHOWN)
 
 
 def table1(runs: pd.DataFrame, settings: MetricsConfig = SETTINGS) -> pd.DataFrame:
@@ -64,18 +63,16 @@ def cells(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
     """{(first cell of the row, column): cell} as Markdown prints it."""
     head, _, *lines = markdown(frame).splitlines()
     columns = [name.strip() for name in head.split("|")[2:-1]]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    return {
-        (row, name): cell for row, *rest in rows for name, cell in zip(columns, rest, strict=True)
-    }
+    found = {}
+    for row, *rest in ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines):
+        found |= {(row, name): cell for name, cell in zip(columns, rest, strict=True)}
+    return found
 
 
 def table1_of(**values: object) -> dict[tuple[str, str], str]:
-    """The cells of Table 1 for CartPole."""
     variants = list(next(iter(values.values())))  # type: ignore[call-overload]
-    return cells(
-        tables.table1(table1(metrics(["CartPole-v1"], variants, **values)), SETTINGS, CLAIMS.table1)
-    )
+    frame = table1(metrics(["CartPole-v1"], variants, **values))
+    return cells(tables.table1(frame, SETTINGS, CLAIMS.table1))
 
 
 def test_summary_against_pandas_and_scipy() -> None:
@@ -106,21 +103,17 @@ def test_table_1_has_bold_ties_censored_means_and_the_papers_numbers() -> None:
         ("mace_fixed", "CartPole-v1"): "120 / **600** (120 to 120 / 599 to 602); paper: 120 / 620",
         ("mace_full", "CartPole-v1"): "104 / 2000†3 (104 to 104 / 2000 to 2000); paper: 104 / 634",
     }
-
-
-def test_a_mean_of_seeds_that_all_failed_is_never_the_best() -> None:
+    # A mean of seeds that all failed is never the best, though it is shown as the same number.
     ends = {"ppo": [1999, 2000, 2000], "mace_full": [2000] * 3}
-    found = table1_of(
-        convergence_steps=ends, convergence_steps_censored={"ppo": [0, 1, 1], "mace_full": [1] * 3}
-    )
-    assert " / **2000†2** (" in found["ppo", "CartPole-v1"]  # shown as the same number
+    failed = {"ppo": [0, 1, 1], "mace_full": [1] * 3}
+    found = table1_of(convergence_steps=ends, convergence_steps_censored=failed)
+    assert " / **2000†2** (" in found["ppo", "CartPole-v1"]
     assert " / 2000†3 (" in found["mace_full", "CartPole-v1"]
 
 
 def test_companions_have_the_digits_of_their_largest_mean_and_the_users_own_metrics() -> None:
-    own = SETTINGS.model_copy(
-        update={"custom": [f"{__name__}:WORST"], "solved_return": {"DeepSea10-v0": 0.5}}
-    )
+    changes = {"custom": [f"{__name__}:WORST"], "solved_return": {"DeepSea10-v0": 0.5}}
+    own = SETTINGS.model_copy(update=changes)
     frame = metrics(["DeepSea10-v0"], ["ppo", "mace_full"]).assign(worst=-7.0)
     small = frame["variant"] == "ppo"
     frame["final_return"] = np.where(small, 0.6934, -0.0001)
@@ -129,9 +122,8 @@ def test_companions_have_the_digits_of_their_largest_mean_and_the_users_own_metr
     found = cells(tables.companions(supplement(frame, own), own)["DeepSea10-v0"])
     shown = {name: (found[name, "ppo"], found[name, "mace_full"]) for name, _ in found}
     assert shown["Final return"] == ("0.693 (0.693 to 0.693)", "0.000 (0.000 to 0.000)")
-    assert [text.split()[0] for text in shown["Mean return of the beginning"]] == [
-        *("−0.00320", "−0.00210")
-    ]
+    beginning = [text.split()[0] for text in shown["Mean return of the beginning"]]
+    assert beginning == ["−0.00320", "−0.00210"]
     assert shown["Solved at the end"] == ("0.67 (0.00 to 1.00)",) * 2  # the ends of a share
     assert shown["Worst & last"] == ("−7.00 (−7.00 to −7.00)",) * 2
     assert "." not in shown["Convergence (range)"][0]
@@ -149,28 +141,19 @@ def test_returns_worst_seeds_and_solved_tasks_by_variant_and_environment() -> No
     assert found["PPO (Baseline)", "A-v0"].startswith("−2.00 (")
     assert found["MACE-RL (Full)", "B-v0"].startswith("7.00 (")
     assert found["PPO (Baseline)", "B-v0"] == ""
-    worst = cells(tables.worst(frame, SETTINGS))
-    assert worst == {
-        ("ppo", "A-v0"): "−3.00",
-        ("ppo", "B-v0"): "",
-        ("mace_full", "A-v0"): "0.00",
-        ("mace_full", "B-v0"): "6.00",
-    }
+    worst = {("ppo", "A-v0"): "−3.00", ("ppo", "B-v0"): ""}
+    worst |= {("mace_full", "A-v0"): "0.00", ("mace_full", "B-v0"): "6.00"}
+    assert cells(tables.worst(frame, SETTINGS)) == worst
     assert cells(tables.solved(frame))["mace_full", "B-v0"] == "2 of 3"
 
 
 def test_betas_are_of_runs_in_which_beta_changes() -> None:
-    frame = pd.DataFrame(
-        {
-            "env": "A-v0",
-            "variant": ["ppo", "ppo", "mace_full", "mace_full", "mace_full"],
-            "seed": [0, 1, 0, 1, 2],
-            "beta_end": [0, 0, 0.9, 0.125, 0.5],
-            "beta_lowest": [0, 0, 0.25, 0.1, 0.2],
-            "beta_highest": [0, 0, 1.0, 0.9, 0.9],
-            "stagnation_correlation": [0.0, 0, 0.5, 0.25, 0.375],
-        }
-    )
+    frame = pd.DataFrame({"env": "A-v0", "variant": ["ppo"] * 2 + ["mace_full"] * 3})
+    frame["seed"] = [0, 1, 0, 1, 2]
+    frame["beta_end"] = [0, 0, 0.9, 0.125, 0.5]
+    frame["beta_lowest"] = [0, 0, 0.25, 0.1, 0.2]
+    frame["beta_highest"] = [0, 0, 1.0, 0.9, 0.9]
+    frame["stagnation_correlation"] = [0.0, 0, 0.5, 0.25, 0.375]
     (row,) = tables.betas(frame, SETTINGS).to_numpy()
     low, high = scipy.stats.t.interval(0.95, 2, 0.375, 0.125 / 3**0.5)
     assert list(row[:2]) == ["A-v0", "mace_full"]
@@ -179,13 +162,10 @@ def test_betas_are_of_runs_in_which_beta_changes() -> None:
 
 
 def test_table_2_has_the_papers_rows_then_ours() -> None:
-    changes = {
-        "gae_lambda": 0.95,
-        "network": TorchModule(kind="torch", module="my_nets:layer_norm"),
-    }
-    fragment = table2_latex(
-        {"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": PPO.model_copy(update=changes)}, CLAIMS.table2
-    )
+    network = TorchModule(kind="torch", module="my_nets:layer_norm")
+    hopper = PPO.model_copy(update={"gae_lambda": 0.95, "network": network})
+    runs = {"Acrobot-v1": PPO, "A_b-v0": PPO, "Hopper": hopper}
+    fragment = table2_latex(runs, CLAIMS.table2)
     paper, ours = fragment.split(r"\midrule")[1:]
     assert re.findall(r"\\raggedright (.*) \\\\", paper) == [
         "Actor Learning Rate & 0.0003",
@@ -216,9 +196,8 @@ def test_the_caption_names_intervals_and_budgets(fewest: int, expected: str) -> 
     frame = metrics(seeds=12)
     hopper = frame["env"] == "HopperBulletEnv-v0"
     frame.loc[hopper, "episodes"] = 6000
-    fragment = table1_latex(
-        table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS), {}, SETTINGS, CLAIMS.table1
-    )
+    shown = table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS)
+    fragment = table1_latex(shown, {}, SETTINGS, CLAIMS.table1)
     assert expected in fragment
     assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
     assert "nan" not in fragment and (r"{\scriptsize --/--}" in fragment) == (fewest == 1)
@@ -260,9 +239,10 @@ def test_special_characters_are_escaped_once() -> None:
     )
 
 
-@pytest.mark.skipif(
-    shutil.which("pdflatex") is None and "CI" not in os.environ, reason="needs pdflatex"
-)
+NO_LATEX = shutil.which("pdflatex") is None and "CI" not in os.environ
+
+
+@pytest.mark.skipif(NO_LATEX, reason="needs pdflatex")
 def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> None:
     many = metrics([*ENVIRONMENTS, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
     many["sample_efficiency"] += 1000  # four digits in every cell are the widest there are
@@ -271,10 +251,7 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     fragments = [
         table1_latex(table1(many, SETTINGS), labels, SETTINGS, CLAIMS.table1),
         table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS, CLAIMS.table1),
-        table2_latex(
-            {"A_b-v0": PPO, "HopperBulletEnv-v0": PPO.model_copy(update={"clip": 0.1})},
-            CLAIMS.table2,
-        ),
+        table2_latex({"A_b-v0": PPO, "B-v0": PPO.model_copy(update={"clip": 0.1})}, CLAIMS.table2),
     ]
     assert re.findall(r"Algorithm & (.*) \\\\", fragments[0]) == [
         *(" & ".join(ENVIRONMENTS), r"Under\_score-v0 & MountainCarContinuous-v0")  # below
@@ -310,12 +287,8 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     kinds = {"table1": table1, "supplement": supplement, "comparisons": comparisons}
     kinds["aggregate"] = aggregate
     data = {name: make(runs, SETTINGS) for name, make in kinds.items()}
-    beta = {
-        "beta_end": 0.5,
-        "beta_lowest": runs["seed"] / 10,
-        "beta_highest": 0.6,
-        "stagnation_correlation": 0,
-    }
+    beta = {"beta_end": 0.5, "beta_lowest": runs["seed"] / 10, "beta_highest": 0.6}
+    beta["stagnation_correlation"] = 0
     data |= {"metrics": runs, "betas": runs[["env", "variant", "seed"]].assign(**beta)}
     equal = dict.fromkeys(VARIANTS, 0.0)
     claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, PAPERS)

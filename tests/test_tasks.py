@@ -3,18 +3,17 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
+from shared import ROOT
 
 from mace_rl.environments.tasks import BarrenRegion, DeepSea, NoisyDeepSea
 from mace_rl.study.config import Study, read_study
 
-ROOT = Path(__file__).parents[1]
 NORTH, EAST, SOUTH, WEST = range(4)
 
 # By state and action: probability, next state, reward, end; as Gymnasium's grids have it.
@@ -63,7 +62,6 @@ def test_gymnasium_accepts_them(study, recwarn):
 
 
 def test_random_returns_of_the_study(study):
-    """As the configuration has them, measured: against the exact expectations."""
     expected = {f"DeepSea{size}-v0": 2.0**-size - 0.005 for size in (10, 20)}
     for name in ("FrozenLake8x8Deterministic-v0", "CliffWalking200-v0"):
         env = gymnasium.make(name).unwrapped
@@ -95,9 +93,6 @@ def at_random(right: list[float], size: int) -> float:
         return p * (reward + there) + (1 - p if row else 1 / 3) * back
 
     return ahead(0, 0)
-
-
-# --- Gymnasium's --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("skilled", [False, True])
@@ -141,9 +136,6 @@ def test_the_television_of_the_noisy_mountain_car():
     assert kstest(shown, "uniform", args=(-1, 2)).pvalue > 0.01
 
 
-# --- Deep sea -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("size", [1, 5, 9])
 def test_returns_of_the_deep_sea(size):
     """Of all sequences of actions: one pays, and the others cost their moves to the right."""
@@ -182,11 +174,24 @@ def test_the_archive_of_the_noisy_deep_sea():
     assert kstest(pages, "uniform", args=(101, 1000)).pvalue > 0.01
 
 
-# --- Barren region ------------------------------------------------------------------------------
+@pytest.mark.parametrize("late", range(7))
+def test_the_archive_of_the_late_deep_sea_is_beside_its_goal(late):
+    """Right all along but for one third action, which is 0 in five rows and the door in two."""
+    env, plain = gymnasium.make("LateDeepSea7-v0"), DeepSea(7)
+    actions = [plain.right[8 * row] for row in range(7)]
+    assert play(env, actions)[1:] == (pytest.approx([-0.01 / 7] * 6 + [1 - 0.01 / 7]), True)
+    actions[late] = 2
+    observations, rewards, terminated = play(env, [*actions, 0, 1, 2, 0, 1])
+    if late < 5:
+        actions[late] = 0
+        assert (observations, rewards, terminated) == play(plain, actions)
+    else:  # no action leads out, up to the time limit
+        assert rewards[late:] == [-0.001] * (12 - late) and not terminated
+        assert min(observations[late + 1 :]) >= 50 > max(observations[: late + 1])
+    check_env(env.unwrapped, skip_render_check=True)
 
 
 def transitions(env: BarrenRegion) -> Table:
-    """Every action in every cell, tried."""
     env.reset(seed=0)
     table = {}
     for cell, action in itertools.product(range(len(env.kinds)), range(4)):

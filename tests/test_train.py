@@ -2,24 +2,17 @@
 
 import io
 import math
-from pathlib import Path
-from unittest.mock import Mock
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box
-from gymnasium.wrappers import TransformObservation
-from shared import LAYER_NORM, VARIANTS, Bonanza, Twin, finish
+from shared import LAYER_NORM, ROOT, VARIANTS, Bonanza, Twin, finish
 
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.config.reading import merge
 from mace_rl.experience import Experience
-from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.records import EpisodeRecord
-from mace_rl.refusal import Refusal
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
 from mace_rl.study.config import read_study
@@ -37,18 +30,14 @@ SETTINGS = {
     "a network of one's own": {"ppo": {"network": LAYER_NORM}},
 }
 
-# --- One round ----------------------------------------------------------------------------------
-
 
 def rollouts_of(trainer: Trainer, monkeypatch) -> list[list]:
-    """The rollouts that `trainer` will learn from."""
     rollouts, improve = [], trainer.improve
     monkeypatch.setattr(trainer, "improve", lambda r: (rollouts.append(r), improve(r))[1])
     return rollouts
 
 
 def parts(item: Experience, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The extrinsic and the intrinsic one of an episode."""
     return getattr(item, f"extrinsic_{name}"), getattr(item, f"intrinsic_{name}")
 
 
@@ -103,12 +92,7 @@ def test_each_reward_has_its_own_returns_and_critic(run_config, scaled):
 
 @pytest.mark.parametrize(
     ("variant", "scaled", "centred"),
-    [
-        ("ppo", True, False),
-        ("mace_fixed", False, True),
-        ("mace_full", True, True),
-        ("mace_full", True, False),
-    ],
+    [("ppo", True, False), ("mace_fixed", False, True), ("mace_full", True, True)],
 )
 def test_update_learns_from_a_e_plus_beta_a_i(run_config, monkeypatch, variant, scaled, centred):
     """The batch that PPO gets, from the episodes by hand, with the episodes' own β.
@@ -176,47 +160,33 @@ def test_normaliser_of_the_update_is_that_of_acting(run_config):
     [("Pendulum-v1", "mace_full"), *(("CartPole-v1", variant) for variant in VARIANTS)],
 )
 def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment, variant):
-    """Every number of every row another way: two epochs over whole rollouts of some episodes.
-
-    What an update is in its last epoch, from one with the first epoch only.
-    """
-    settings = {"rollout_steps": 400 if environment == "Pendulum-v1" else 60, "epochs": 2}
-    meta = {"horizon": 1, "learn_every": 1}
-    changes = {"ppo": settings | {"minibatch_size": None}, "meta": meta}
-    config = run_config(environment, variant, 1, episodes=9, **changes)
-    trainer = Trainer(config)
-    rollouts, learnt, batches, critics = rollouts_of(trainer, monkeypatch), [], [], []
+    """The learner's own numbers, which test_ppo.py checks, and the others another way."""
+    settings = {"rollout_steps": 400 if environment == "Pendulum-v1" else 60}
+    meta = {"horizon": 1}
+    trainer = Trainer(run_config(environment, variant, 1, episodes=9, ppo=settings, meta=meta))
+    rollouts, told, critics = rollouts_of(trainer, monkeypatch), [], []
     update = trainer.ppo.update
-    first_epoch = merge(changes, {"ppo": {"epochs": 1}})
-    once = Trainer(run_config(environment, variant, 1, **first_epoch)).ppo
 
     def noted(batch, returns):
         critics.append({kind: Twin(one) for kind, one in trainer.ppo.critics.items()})
-        once.load_state_dict(trainer.ppo.state_dict())
-        once.update(batch, returns)
-        learnt.append({"actor": Twin(once.policy)} | {k: Twin(v) for k, v in once.critics.items()})
-        batches.append((batch, returns))
-        return update(batch, returns)
+        told.append(update(batch, returns))
+        return told[-1]
 
     monkeypatch.setattr(trainer.ppo, "update", noted)
     episodes = [records[-1] for records in trainer.run()]
     assert len(trainer.diagnostics) == len(rollouts) == len(episodes) > 2
     for number, (row, rollout) in enumerate(zip(trainer.diagnostics, rollouts, strict=True)):
         observations = np.concatenate([item.observations[:-1] for item in rollout])
-        actions = np.concatenate([item.episode.actions for item in rollout])
-        policy = learnt[number]["actor"].policy(observations)
-        old = np.concatenate([item.episode.log_probs for item in rollout])
-        log_ratio = policy.log_prob(torch.from_numpy(actions)) - torch.from_numpy(old)
-        ratio = log_ratio.exp()
         expected = {
             "update": number + 1,
             "episode": episodes[number].episode,
             "env_steps": episodes[number].env_steps,
-            "approximate_kl": (ratio - 1 - log_ratio).mean().item(),
-            "clip_fraction": ((ratio > 1.2) | (ratio < 0.8)).double().mean().item(),
-            "entropy": policy.entropy().mean().item(),
             "beta": np.mean([item.beta for item in rollout]),
         }
+        for name in ("approximate_kl", "clip_fraction", "entropy"):
+            expected[name] = getattr(told[number], name)
+        for name, norm in told[number].gradient_norms.items():
+            expected[f"gradient_norm_{name}"] = norm
         own, weighted = [], []
         for item in rollout:
             extrinsic, intrinsic = parts(item, "advantages")
@@ -224,16 +194,6 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
             weighted.extend(item.beta * intrinsic / item.intrinsic_scale)
         squares = np.square(own).sum(), np.square(weighted).sum()
         expected["bonus_share"] = squares[1] / sum(squares)
-        batch, targets = batches[number]
-        advantages = torch.from_numpy(batch.advantages)
-        clipped = torch.min(ratio * advantages, ratio.clamp(0.8, 1.2) * advantages)
-        losses = {"actor": -clipped.mean()}
-        for kind, target in targets.items():
-            values = learnt[number][kind](observations)[:, 0]
-            losses[kind] = (values - torch.from_numpy(target)).square().mean()
-        for name, loss in losses.items():
-            norm = np.linalg.norm(learnt[number][name].gradient(loss))
-            expected[f"gradient_norm_{name}"] = norm
         for kind, critic in critics[number].items():
             returns = np.concatenate([getattr(item, f"{kind}_returns") for item in rollout])
             errors = returns - critic(observations)[:, 0].detach().numpy()
@@ -249,11 +209,7 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
     assert row.approximate_kl > 0 and (row.bonus_share > 0) == (variant != "ppo")
 
 
-# --- β = 0 is PPO -------------------------------------------------------------------------------
-
-
 def without_bonus(records: list[EpisodeRecord]) -> list[dict]:
-    """All that a record says of the environment's episode."""
     return [{**vars(record), "intrinsic_return": None} for record in records]
 
 
@@ -270,13 +226,12 @@ def learned(trainer: Trainer) -> list[bytes]:
 @pytest.mark.parametrize(
     ("environment", "settings"),
     [
-        *(("CartPole-v1", settings) for settings in list(SETTINGS)[:4]),
+        *(("CartPole-v1", settings) for settings in SETTINGS),
         pytest.param("Acrobot-v1", "an episode", marks=pytest.mark.slow),
         pytest.param("HopperBulletEnv-v0", "an episode", marks=pytest.mark.slow),
     ],
 )
 def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, settings):
-    """Though memory, novelty, the intrinsic critic and the meta network are all at work."""
     changes = {"episodes": 12, "meta": {"horizon": 1}, "novelty": SOON} | SETTINGS[settings]
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
@@ -293,11 +248,7 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
         assert sum(record.intrinsic_return for record in trainer.records) > 10
         assert len(trainer.curiosity.memory) > 0
         assert len(trainer.curiosity.novelty.visited) > 100  # so that all of novelty is estimated
-    untrained = Trainer(full.config).controller.network
-    assert (full.controller.network.parameters != untrained.parameters).any()
-
-
-# --- The same seed is the same run, and another is not ------------------------------------------
+    assert full.controller.integrator.squares > 0 and len(full.controller.gauge.windows) == 12
 
 
 def test_another_seed_is_another_run(run_config):
@@ -311,7 +262,6 @@ def test_another_seed_is_another_run(run_config):
 
 @pytest.mark.parametrize("settings", ["an episode", "torch", "a network of one's own"])
 def test_global_generators_are_left_alone(run_config, settings):
-    """Nothing depends on them, and nothing that uses them is disturbed."""
     changes = {"episodes": 4, "novelty": SOON} | SETTINGS[settings]
     config = run_config("CartPole-v1", "mace_full", 0, **changes)
     expected = finish(config).records
@@ -336,25 +286,23 @@ def test_global_generators_are_left_alone(run_config, settings):
     [
         ("CartPole-v1", "mace_full", "several"),
         ("FrozenLake-v1", "mace_fixed", "several"),
-        ("HopperBulletEnv-v0", "ppo", "several"),
         ("HopperBulletEnv-v0", "mace_full", "an episode"),
-        ("CartPole-v1", "ppo", "torch"),
         ("FrozenLake-v1", "mace_full", "torch"),
         ("Pendulum-v1", "mace_full", "a network of one's own"),
     ],
 )
 def test_state_holds_all_that_the_rest_depends_on(run_config, environment, variant, settings):
     """Continued by a new trainer from what a file would hold, with several episodes a rollout."""
-    meta = {"horizon": 2, "learn_every": 6}
-    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}, "meta": meta, "novelty": SOON}
+    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}, "meta": {"horizon": 2}}
+    changes |= {"novelty": SOON}
     config = run_config(environment, variant, 2, **merge(SETTINGS[settings], changes))
     whole = Trainer(config)
     rounds = whole.run()
     for _ in range(3):
         next(rounds)
     state = archive(whole.state_dict())
-    if variant == "mace_full" and environment != "Pendulum-v1":  # which has one episode a round
-        assert len(whole.controller.training_batch) > 0  # not learned from yet
+    if variant == "mace_full":
+        assert len(whole.controller.judge.pending) == 2
     for _ in rounds:
         pass
     rest = Trainer(config)
@@ -376,9 +324,6 @@ def test_equal_states_have_equal_bytes():
     assert archive(apart) == archive(together)
 
 
-# --- Every kind of environment ------------------------------------------------------------------
-
-ROOT = Path(__file__).parents[1]
 OTHERS = read_study([ROOT / "config.yaml", ROOT / "config" / "environments.yaml"])
 
 
@@ -386,9 +331,8 @@ OTHERS = read_study([ROOT / "config.yaml", ROOT / "config" / "environments.yaml"
     ("environment", "variant", "changes"),
     [
         ("FrozenLake-v1", "ppo", {}),  # Discrete observations
-        ("FrozenLake-v1", "mace_full", {}),
         ("Pendulum-v1", "mace_fixed", {"ppo": {"rollout_steps": 500} | AS_THEY_ARE}),  # Box actions
-        ("MountainCar-v0", "mace_full", {"meta": {"max_sequence": None}}),
+        ("MountainCar-v0", "mace_full", {}),
         *(
             pytest.param(environment, "mace_full", None, marks=pytest.mark.slow)
             for environment in OTHERS.environments
@@ -396,7 +340,6 @@ OTHERS = read_study([ROOT / "config.yaml", ROOT / "config" / "environments.yaml"
     ],
 )
 def test_any_environment_trains(run_config, environment, variant, changes):
-    """Those of config/environments.yaml, too, as that says."""
     if changes is None:
         config = OTHERS.run_config(environment, variant, 0)
     else:
@@ -427,102 +370,3 @@ def test_it_learns_what_pays(run_config, register, variant, network):
     config = run_config(name, variant, 0, episodes=200, ppo=settings)
     returns = [record.extrinsic_return for record in finish(config).records]
     assert np.mean(returns[:10]) < 3.5 and np.mean(returns[-50:]) > 4.5
-
-
-# --- Numbers that go bad ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("where", "value"),
-    [
-        *(("reward", value) for value in (np.nan, 1e160, -1.7e308)),
-        ("observation", np.inf),
-        ("observation", np.float32(-3e38)),
-        ("first observation", -np.inf),
-    ],
-)
-@pytest.mark.parametrize(("variant", "scaled"), [("ppo", True), ("mace_full", False)])
-def test_bad_numbers_stop_the_run_and_say_where(
-    run_config, register, where, value, variant, scaled
-):
-    name = register("Bonanza-v0", Bonanza, 5, where=where, value=value)
-    settings = {"scale_rewards": scaled, "scale_advantages": scaled}
-    trainer = Trainer(run_config(name, variant, 7, episodes=9, ppo=settings))
-    finished = []
-    with pytest.raises(NonFiniteError) as caught:
-        for records in trainer.run():
-            finished += records
-    place = "the reset" if "first" in where else "step 3"
-    what = where.removeprefix("first ")
-    message = f"Bonanza-v0 {variant} seed 7, episode 4: the {what} is {value:g} after {place}"
-    assert str(caught.value).partition(", but float32 learns from less than 1e+12")[0] == message
-    assert len(finished) == 3
-
-
-def moved(unit: float, offset: float, reward: float = 0.0) -> gymnasium.Env:
-    """Bonanza with another first dimension and a large reward."""
-    space, env = Box(-1e9, 1e9, (2,), np.float64), Bonanza("reward", reward)
-    return TransformObservation(env, lambda x: x * [unit, 1.0] + [offset, 0.0], space)
-
-
-LOST = "differences in observation[0]"
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        *(((unit, offset), LOST) for unit, offset in ((1e-9, 0), (1, 1e8), (1, 1e7))),
-        *(((unit, offset), "") for unit, offset in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
-        ((1, 0, 1e11), "the rewards of episode 4"),
-    ],
-)
-def test_what_is_lost_is_named_once(run_config, register, caplog, given, said):
-    names = ("unit", "offset", "reward")
-    name = register("Moved-v0", moved, 50, **dict(zip(names, given, strict=False)))
-    finish(run_config(name, "ppo", 0, episodes=9))
-    found = [record.message.split(" are")[0] for record in caplog.records]
-    assert found == ([f"Moved-v0: {said}"] if said else [])
-
-
-@pytest.mark.parametrize("place", [0, -1])  # around every tanh
-@pytest.mark.parametrize(
-    ("part", "message"),
-    [
-        *((name, f"the update after episode 3: .*{name}.* is (nan|inf)") for name in NETWORKS),
-        ("density", "episode 1: a log-density is nan"),
-        ("meta", "episode 2: β is nan"),
-    ],
-)
-def test_bad_weights_stop_the_run_and_say_whose(run_config, part, message, place):
-    """One of them is bad from the start, or from within the third update."""
-    novelty = SOON | {"neighbours": [1], "refresh_every": 1}
-    trainer = Trainer(run_config("CartPole-v1", "mace_full", 0, episodes=9, novelty=novelty))
-    owners = {"actor": trainer.ppo.policy, "density": trainer.curiosity.novelty.density}
-    owner = (owners | trainer.ppo.critics | {"meta": trainer.controller})[part]
-    update = trainer.ppo.update
-
-    def spoil(value):
-        own = np.flatnonzero(Twin(owner).own())  # none of the zeros that are added
-        getattr(owner, "network", owner).parameters[own[place]] = value
-
-    def update_spoilt(batch, returns):
-        if len(trainer.records) == 3:
-            spoil(np.nan if place else np.inf)  # which a tanh hides
-        return update(batch, returns)
-
-    if part in NETWORKS:
-        trainer.ppo.update = update_spoilt
-    else:
-        spoil(np.nan)
-    with pytest.raises(NonFiniteError, match=f"CartPole-v1 mace_full seed 0, {message}"):
-        finish(trainer)
-
-
-@pytest.mark.parametrize("ends", [SystemExit(0), SystemExit("why"), GeneratorExit()], ids=repr)
-def test_code_that_ends_the_program_is_an_error(run_config, register, monkeypatch, ends):
-    name = register("Bonanza-v0", Bonanza, 5)
-    trainer = Trainer(run_config(name, "ppo", 3, episodes=9))
-    monkeypatch.setattr(Bonanza, "step", Mock(side_effect=ends))
-    with pytest.raises(Refusal, match="ppo seed 3, episode 1: code raised") as refused:
-        list(trainer.run())
-    assert repr(ends) in str(refused.value)

@@ -1,4 +1,4 @@
-"""What a run's files may not do to whoever reads them: run code, or crash; docs/reliability.md."""
+"""What a run's files may not do to whoever reads them; what is damaged or differs is named."""
 
 import io
 import json
@@ -10,14 +10,17 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from shared import LAYER_NORM, call
+from shared import GOOD, LAYER_NORM, call, refusal, refused
 
 from mace_rl import files
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.plugins import code_outside, make
 from mace_rl.config.section import ConfigError
+from mace_rl.records import RecordError
+from mace_rl.runs import verify
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import CheckpointError, archive
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import file_digest
 
 PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
@@ -101,27 +104,6 @@ def test_names_of_this_package_and_other_texts_are_no_code_from_outside():
     assert [*code_outside({"a": "mace_rl_x:Y", "b": [" os:X"], "c": ":"})] == ["c", "b", "a"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
-        (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
-        (r"\A.*\Z", '["config", "outputs"]', "the configuration is "),
-        (r'"outputs": \{.*?\}', '"outputs": 3', "outputs is 3, but"),
-        (r'"machine": \{.*?\}', '"machine": 3', "machine is 3, but"),
-        ('"mace_fixed"', '"a,b"', "config.variant is 'a,b', but"),
-        ('"CartPole-v1"', '"CartPole-v1,0"', "config.environment is 'CartPole-v1,0', but"),
-    ],
-)
-def test_what_no_run_wrote_is_one_line(kept, monkeypatch, old, new, message):
-    run = kept()
-    text = (run / files.RECORD).read_text()
-    (run / files.RECORD).write_text(re.sub(old, new, text, count=1, flags=re.DOTALL))
-    for words in (f"evaluate {run}", f"watch {run}", "verify .", "export . --out a.csv"):
-        code, said = call(monkeypatch, *words.split())
-        assert code == 1 and re.search(rf"^[^\n]*run\.json: {message}[^\n]*$", said), said
-
-
 def compressed():
     """A zip file that unpacks to more than it is."""
     data = io.BytesIO()
@@ -154,6 +136,118 @@ def test_an_agent_that_does_not_fit_is_refused_by_the_entry(kept, message):
     state = torch.load(run / files.AGENT, weights_only=True)
     (run / files.AGENT).write_bytes(DAMAGE[message](state))
     kept()  # with its digest
-    with pytest.raises(CheckpointError, match=rf"agent\.pt: {message}") as caught:
+    with refused(CheckpointError, rf"agent\.pt: {message}"):
         load_agent(run)
-    assert "\n" not in str(caught.value)
+
+
+# --- A finished run's parts -----------------------------------------------------------------------
+
+READ = {  # by the command
+    "evaluate": [files.AGENT],
+    "watch": [files.AGENT],
+    "verify": [files.EPISODES],
+    "export": [files.EPISODES],
+    "tensorboard": [files.EPISODES, files.DIAGNOSTICS],
+    "train": [*files.RESULTS],
+}
+RECORDS = [  # a text of run.json, another in its place, and what is said
+    (r"\A.*\Z", "{", "not readable"),
+    (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
+    (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
+    (r"\A.*\Z", "[]", "the configuration is |"),
+    (r"\A.*\Z", "{}", "the key 'config' is missing"),
+    (r"\A.*\Z", '{"config": {"environment": 1}}', "config.environment is 1, but should be a valid"),
+    (r'"outputs": \{.*?\}', '"outputs": 3', "outputs is 3, but"),
+    (r'"machine": \{.*?\}', '"machine": 3', "machine is 3, but"),
+    ('"ppo"', '"a,b"', "config.variant is 'a,b', but"),
+    ('"CartPole-v1"', '"CartPole-v1,0"', "config.environment is 'CartPole-v1,0', but"),
+]
+
+
+@pytest.fixture
+def said_of(trained, monkeypatch, tmp_path):
+    """`said_of(command, file, content)`: what it says of a run with that in a file; None: gone."""
+    run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "run")
+    options = {"export": ["--out", str(tmp_path / "a.csv")], "train": [*sum(GOOD.items(), ())]}
+
+    def damaged(command: str, name: str, content: bytes | None) -> str:
+        path = run / name
+        whole = path.read_bytes()
+        path.unlink() if content is None else path.write_bytes(content)
+        place = ["--out", str(run)] if command == "train" else [str(run)]
+        said = refusal(monkeypatch, command, *place, *options.get(command, []))
+        path.write_bytes(whole)
+        assert str(run) in said
+        assert {one.name for one in run.iterdir()} == {*files.RESULTS, files.RECORD, files.LOCK}
+        return said
+
+    return damaged
+
+
+@pytest.mark.parametrize(("command", "name"), [(one, name) for one in READ for name in READ[one]])
+def test_a_file_that_is_not_the_one_of_run_json(said_of, command, name):
+    for content in (None, b"episode\n1\n"):
+        if content or name != files.DIAGNOSTICS or command == "train":  # kept runs are without it
+            said = said_of(command, name, content)
+            assert re.search(rf"/{name}: (missing, cut off or altered|line 1: the column)", said)
+
+
+@pytest.mark.parametrize("command", READ)
+def test_a_run_json_that_is_none(said_of, trained, command):
+    whole = (trained("CartPole-v1", "ppo", episodes=3) / files.RECORD).read_text(encoding="utf-8")
+    for old, new, expected in RECORDS:
+        content = re.sub(old, new, whole, count=1, flags=re.DOTALL).encode()
+        assert re.search(rf"/run\.json: {expected}", said_of(command, files.RECORD, content))
+    if command not in ("train", "tensorboard"):  # which are for unfinished runs, too
+        assert "no finished run in" in said_of(command, files.RECORD, None)
+
+
+@pytest.mark.parametrize("text", ["episode\nx\n", "", "\x00", '"'])
+def test_what_no_training_wrote_though_its_digest_is_right(trained, tmp_path, text):
+    run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "run")
+    record = json.loads((run / files.RECORD).read_text(encoding="utf-8"))
+    for name in (files.EPISODES, files.DIAGNOSTICS):
+        (run / name).write_text(text, encoding="utf-8")
+        record["outputs"][name] = file_digest(run / name)
+    (run / files.RECORD).write_text(json.dumps(record), encoding="utf-8")
+    for part, file in (("rows", "episodes"), ("episodes", "episodes"), ("diagnostics",) * 2):
+        with pytest.raises(RecordError, match=rf"/{file}\.csv: [^\n]*$"):
+            getattr(FinishedRun(run), part)
+
+
+# --- verify ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("section", "change", "said"),
+    [
+        ("config", {"seed": 1}, "different from episode 1; mean return"),
+        ("outputs", {"agent.pt": "0" * 64}, "different in the agent's weights only;"),
+        ("versions", {"numpy": "1.0"}, "versions.numpy was '1.0' and is"),
+    ],
+)
+def test_verify_says_what_differs(trained, tmp_path, monkeypatch, capsys, section, change, said):
+    run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "runs")
+    path = run / "run.json"
+    record = json.loads(path.read_text(encoding="utf-8"))
+    record["machine"]["cpu"] = "Z80"
+    record["config"]["seed"] = int(section != "outputs")
+    record[section].update(change)
+    path.write_text(json.dumps(record), encoding="utf-8")
+    expected = "mace-rl: not reproduced: 0 of 1 runs equal to the bit"
+    assert call(monkeypatch, "verify", str(tmp_path)) == (1, expected)
+    assert said in capsys.readouterr().out
+
+
+def test_a_sample_is_as_large_as_asked_and_always_the_same(tmp_path, monkeypatch):
+    folders = [tmp_path / f"runs/CartPole-v1/ppo/seed{seed}" for seed in range(10, 20)]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "run.json").touch()
+
+    def drawn(sample: int | None) -> list[str]:
+        return [*verify.verify(tmp_path, sample)][:-1]
+
+    monkeypatch.setattr(verify, "repeat", lambda run: (True, str(run.folder)))
+    assert drawn(None) == drawn(99) == [*map(str, folders)]
+    assert drawn(3) == drawn(3) == sorted({*drawn(3)} & {*drawn(None)}) and len(drawn(3)) == 3

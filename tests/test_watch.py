@@ -21,8 +21,6 @@ pytestmark = pytest.mark.slow
 
 
 class NoDisplay(CartPoleEnv):
-    """A renderer that fails."""
-
     def render(self):
         raise OSError("no display")
 

@@ -50,7 +50,7 @@ def absences(spread: str, seeds: int, count: int, end: int) -> np.ndarray:
 
 def claims_by(rule: int) -> ClaimsConfig:
     """The paper's claims, robust; by the second rule C9 is about the time before the bar."""
-    values = read_yaml(Path("config/claims.yaml"))
+    values = read_yaml(Path("reference/confirmation/claims.yaml"))
     title, family = next(iter(values["families"].items()))
     family["words"]["no_room"] = "could not be asked"
     for claim in family["claims"].values():

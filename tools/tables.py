@@ -3,10 +3,11 @@
     python -m tools.tables [--check]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-The runs in `KEPT` are unpacked, and Snakemake makes of them, into results/tables/STUDY, the outputs
-that reference/studies.yaml names, and README.md: tables.md with the pictures that are among these,
-and the verdicts of the first study beside those of this one. They are compared with those in
-reference/tables. New ones are kept there, and README.md, which only shows the others, is renewed;
+The runs in `KEPT` are unpacked, and Snakemake makes of them, in results/tables/STUDY and by the
+configuration that the study had, the outputs that reference/studies.yaml names, and README.md:
+tables.md with the pictures that are among these, and the verdicts of the first study beside those
+of this one. They are compared with those in reference/tables. New ones are kept there, and
+README.md, which only shows the others, is renewed;
 with --check both are mistakes. With --report only the page of one study is made, and not compared.
 """
 
@@ -41,21 +42,28 @@ ROBUST = "robust"  # the way to measure that is compared
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
-    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "forest"),
-    *("readings", "page"),
+    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "readings"),
+    "page",
 )
 
 
 def make(name: str, study: dict[str, Any]) -> None:
-    """Make the `outputs` of one study; `ValueError` with what Snakemake says if it cannot."""
-    folder = MADE / name
+    """Make the `outputs` of one study; `ValueError` with what Snakemake says if it cannot.
+
+    Where it is started `config/` is the study's own, and the pages name the command as it was.
+    """
+    folder = ROOT / MADE / name
     folder.mkdir(parents=True)
     (folder / "runs").symlink_to("../runs", target_is_directory=True)
-    command = [sys.executable, "-m", "snakemake", "--cores", str(CORES)]
-    command += ["--allowed-rules", *RULES, "--configfile", *study["configfiles"]]
+    (folder / "config").symlink_to(ROOT / study["configuration"], target_is_directory=True)
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
+    command += ["--cores", str(CORES), "--allowed-rules", *RULES]
+    command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    done = subprocess.run(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     if done.returncode:
         raise ValueError(f"{name}: {done.stdout.strip()}")
 

@@ -2,8 +2,7 @@
 
     from mace_rl import CuriosityReward, VectorCuriosityReward, load_agent, settings, train
 
-Each is imported when it is asked for. Importing changes nothing in the process; the commands import
-`mace_rl.pins` as well, which does.
+Each is imported when it is asked for.
 """
 
 from importlib import import_module

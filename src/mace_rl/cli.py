@@ -22,136 +22,103 @@ logger = logging.getLogger(__name__)
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mace-rl`."""
-    top = argparse.ArgumentParser(
-        prog="mace-rl",
-        description=__doc__,
-        epilog="example: mace-rl train --help",
-        allow_abbrev=False,
-    )
+    plain: dict[str, Any] = {"allow_abbrev": False}
+    epilog = "example: mace-rl train --help"
+    top = argparse.ArgumentParser(prog="mace-rl", description=__doc__, epilog=epilog, **plain)
     commands = top.add_subparsers(dest="command", required=True)
 
-    def command(name: str, does: str, example: str) -> Callable[..., Any]:
+    def command(
+        name: str, run: Callable[..., None], does: str, example: str, folder: str = ""
+    ) -> Callable[..., Any]:
         epilog = f"example: mace-rl {name} {example}"
-        return commands.add_parser(
-            name, help=does, description=does, epilog=epilog, allow_abbrev=False
-        ).add_argument
+        added = commands.add_parser(name, help=does, description=does, epilog=epilog, **plain)
+        added.set_defaults(run=run)
+        if folder:
+            added.add_argument("folder", type=Path, help=folder)
+        return added.add_argument
 
-    add = command(
-        "train",
-        "carry out one training run; the same command resumes it if interrupted",
-        "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run",
-    )
+    flag = {"action": "store_true"}
+    trust = {**flag, "help": "import code that run.json names"}
+    below = "of a run, or with runs below it"
+    does = "carry out one training run; the same command resumes it if interrupted"
+    run = "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run"
+    add = command("train", train, does, run)
     add("--env", required=True, help="a Gymnasium id: [module:][Namespace/]Id")
     add("--variant", required=True, help="one of the config's variant_settings")
     add("--seed", default=0, type=int, help="(default: 0)")
     add("--episodes", type=int, help="instead of the config's budget")
     add("--max-episode-steps", type=int, help="instead of the environment's own time limit")
-    add(
-        "--config",
-        type=Path,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="FILE",
-        help="YAML files read over the default settings, one after the other",
-    )
-    add(
-        "--engine",
-        choices=["compiled", "torch"],
-        help="of every network: compiled (default) or plain PyTorch, slower, to check it by",
-    )
+    several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
+    over = "YAML files read over the default settings, one after the other"
+    add("--config", type=Path, **several, help=over)
+    slower = "of every network: compiled (default) or plain PyTorch, slower, to check it by"
+    add("--engine", choices=["compiled", "torch"], help=slower)
     add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
-    add(
-        "--restart",
-        action="store_true",
-        help="move a run that is in the folder into a folder below it, and train from the start",
-    )
-    add = command(
-        "status",
-        "print how far the workflow's runs are, and about when they will be done",
-        "results/reduced",
-    )
-    add("folder", type=Path, help="the workflow's results folder")
-    for name, does, example, episodes in (
-        (
-            "evaluate",
-            "play episodes with a trained agent and print its returns",
-            "cartpole_run --episodes 20 --deterministic",
-            100,
-        ),
-        (
-            "watch",
-            "write an animated GIF of the first episodes that evaluate plays",
-            "cartpole_run --out cartpole.gif",
-            1,
-        ),
+    anew = "move a run that is in the folder into a folder below it, and train from the start"
+    add("--restart", **flag, help=anew)
+    does = "print how far the workflow's runs are, and about when they will be done"
+    command("status", status, does, "results/reduced", folder="the workflow's results folder")
+    play = "play episodes with a trained agent and print its returns"
+    film = "write an animated GIF of the first episodes that evaluate plays"
+    for name, function, does, example, episodes in (
+        ("evaluate", evaluate, play, "cartpole_run --episodes 20 --deterministic", 100),
+        ("watch", watch, film, "cartpole_run --out cartpole.gif", 1),
     ):
-        add = command(name, does, example)
-        add("folder", type=Path, help="of a finished run")
+        add = command(name, function, does, example, folder="of a finished run")
         add("--episodes", type=int, default=episodes, help=f"how many (default: {episodes})")
         add("--seed", type=int, default=0, help="of the episodes (default: 0)")
-        add(
-            "--deterministic",
-            action="store_true",
-            help="take the most probable action, or the mean, instead of a sample",
-        )
-        add("--trust", action="store_true", help="import code that run.json names")
-    add("--untrained", action="store_true", help="film the agent as it was before training")
+        most = "take the most probable action, or the mean, instead of a sample"
+        add("--deterministic", **flag, help=most)
+        add("--trust", **trust)
+    add("--untrained", **flag, help="film the agent as it was before training")
     add("--seconds", type=float, default=10.0, help="of each episode at most (default: 10)")
     add("--width", type=int, default=300, help="in pixels (default: 300)")
-    add(
-        "--out",
-        type=Path,
-        help="a GIF file (default: watch.gif or watch_untrained.gif in the folder)",
-    )
-    add = command(
-        "tensorboard",
-        "write what runs recorded, finished or not, as event files for TensorBoard",
-        "cartpole_run --out events",
-    )
-    add("folder", type=Path, help="of a run, or with runs below it")
+    out = "a GIF file (default: watch.gif or watch_untrained.gif in the folder)"
+    add("--out", type=Path, help=out)
+    does = "write what runs recorded, finished or not, as event files for TensorBoard"
+    add = command("tensorboard", tensorboard, does, "cartpole_run --out events", below)
     add("--out", type=Path, help="folder for the event files (default: beside the records)")
-    add = command(
-        "export",
-        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ...",
-        "cartpole_run --out runs.csv",
+    does = (
+        "write the episodes of finished runs as one table: task, algorithm, seed, step, return ..."
     )
-    add("folder", type=Path, help="of a run, or with runs below it")
+    add = command("export", export, does, "cartpole_run --out runs.csv", below)
     add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")
-    add = command(
-        "verify",
-        "repeat kept runs and compare to the bit",
-        "reference --sample 1",
-    )
-    add("folder", type=Path, help="of a run, or with runs below it")
+    does = "repeat kept runs and compare to the bit"
+    add = command("verify", verify, does, "reference --sample 1", below)
     add("--sample", type=int, help="how many, always the same ones (default: all)")
-    add("--trust", action="store_true", help="import code that run.json names")
+    add("--trust", **trust)
     return top
 
 
-def run_config(arguments: argparse.Namespace) -> RunConfig:
-    """The run that the command line asks for; raises `ConfigError`."""
-    changes = {key: getattr(arguments, key) for key in ("episodes", "max_episode_steps", "engine")}
-    for key in ("episodes", "max_episode_steps"):
-        option, value = f"--{key.replace('_', '-')}", changes[key]
-        _require(value is None or value >= 1, option, value, "be at least 1")
-    return settings(
-        arguments.env,
-        arguments.variant,
-        seed=arguments.seed,
-        config=arguments.config,
-        **{key: value for key, value in changes.items() if value is not None},
-    )
-
-
 def _require(fits: bool, option: str, value: object, right: str) -> None:
-    """Raise a `ConfigError` that says what an option is and what is right, unless it `fits`."""
     if not fits:
         raise ConfigError(f"{option} is {value!r}, but should {right}")
 
 
+def _require_at_least(smallest: int, arguments: argparse.Namespace, *names: str) -> None:
+    for name in names:
+        option, value = f"--{name.replace('_', '-')}", getattr(arguments, name)
+        _require(value is None or value >= smallest, option, value, f"be at least {smallest}")
+
+
+def _require_playable(arguments: argparse.Namespace) -> None:
+    _require_at_least(1, arguments, "episodes")
+    _require_at_least(0, arguments, "seed")
+    _ = FinishedRun(
+        arguments.folder, arguments.trust
+    ).agent_config  # before PyTorch, which takes seconds
+
+
+def run_config(arguments: argparse.Namespace) -> RunConfig:
+    """The run that the command line asks for; raises `ConfigError`."""
+    _require_at_least(1, arguments, "episodes", "max_episode_steps")
+    changes = {key: getattr(arguments, key) for key in ("episodes", "max_episode_steps", "engine")}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    changes |= {"seed": arguments.seed, "config": arguments.config}
+    return settings(arguments.env, arguments.variant, **changes)
+
+
 def train(arguments: argparse.Namespace) -> None:
-    """`mace-rl train`."""
     config = run_config(arguments)
     default = Path("runs", folder_of(config.environment), config.variant, f"seed{config.seed}")
     out: Path = arguments.out or default
@@ -167,27 +134,19 @@ def train(arguments: argparse.Namespace) -> None:
 
 
 def status(arguments: argparse.Namespace) -> None:
-    """`mace-rl status`."""
     from mace_rl.runs import progress
 
     for line in progress.status(arguments.folder):
         print(line)
 
 
-def _require_playable(arguments: argparse.Namespace) -> None:
-    _require(arguments.episodes >= 1, "--episodes", arguments.episodes, "be at least 1")
-    _require(arguments.seed >= 0, "--seed", arguments.seed, "be at least 0")
-    _ = FinishedRun(arguments.folder, arguments.trust).config  # before PyTorch, which takes seconds
-
-
 def evaluate(arguments: argparse.Namespace) -> None:
-    """`mace-rl evaluate`."""
     _require_playable(arguments)
     from mace_rl.runs import evaluate
 
+    names = ("episodes", "seed", "deterministic", "trust")
     returns = evaluate.evaluate(
-        *(arguments.folder, arguments.episodes, arguments.seed),
-        *(arguments.deterministic, arguments.trust),
+        arguments.folder, **{name: getattr(arguments, name) for name in names}
     )
     print(
         f"{len(returns)} episodes: mean return {returns.mean():.2f}, standard deviation "
@@ -196,7 +155,6 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def watch(arguments: argparse.Namespace) -> None:
-    """`mace-rl watch`."""
     _require(arguments.seconds > 0, "--seconds", arguments.seconds, "be greater than 0")
     _require(50 <= arguments.width <= 2000, "--width", arguments.width, "be from 50 to 2000")
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
@@ -206,16 +164,8 @@ def watch(arguments: argparse.Namespace) -> None:
     _require_playable(arguments)
     from mace_rl.runs import watch
 
-    film = watch.film(
-        arguments.folder,
-        arguments.episodes,
-        arguments.seed,
-        deterministic=arguments.deterministic,
-        untrained=arguments.untrained,
-        trust=arguments.trust,
-        width=arguments.width,
-        seconds=arguments.seconds,
-    )
+    names = ("episodes", "seed", "deterministic", "untrained", "trust", "width", "seconds")
+    film = watch.film(arguments.folder, **{name: getattr(arguments, name) for name in names})
     out.parent.mkdir(parents=True, exist_ok=True)
     files.write_atomically(out, watch.gif(film))
     returns = ", ".join(f"{value:.2f}" for value in film.returns)
@@ -223,7 +173,6 @@ def watch(arguments: argparse.Namespace) -> None:
 
 
 def tensorboard(arguments: argparse.Namespace) -> None:
-    """`mace-rl tensorboard`."""
     from mace_rl.runs import events
 
     out = arguments.out or arguments.folder
@@ -232,7 +181,6 @@ def tensorboard(arguments: argparse.Namespace) -> None:
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """`mace-rl export`."""
     out: Path = arguments.out
     _require(out.suffix in (".csv", ".parquet"), "--out", str(out), "end in .csv or .parquet")
     from mace_rl.runs import export
@@ -243,12 +191,10 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def verify(arguments: argparse.Namespace) -> None:
-    """`mace-rl verify`."""
-    sample = arguments.sample
-    _require(sample is None or sample >= 1, "--sample", sample, "be at least 1")
+    _require_at_least(1, arguments, "sample")
     from mace_rl.runs import verify
 
-    for line in verify.verify(arguments.folder, sample, arguments.trust):
+    for line in verify.verify(arguments.folder, arguments.sample, arguments.trust):
         print(line, flush=True)
 
 
@@ -256,18 +202,9 @@ def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
     outlets.secure()
     arguments = parser().parse_args()
-    commands = {
-        "train": train,
-        "status": status,
-        "evaluate": evaluate,
-        "watch": watch,
-        "tensorboard": tensorboard,
-        "export": export,
-        "verify": verify,
-    }
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
-        commands[arguments.command](arguments)
+        arguments.run(arguments)
     except (Refusal, OSError, MemoryError) as error:
         sys.exit(f"mace-rl: {' '.join(str(error).split())}")
     except ModuleNotFoundError as error:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 
-from mace_rl.agent.advantages import generalised_advantages
+from mace_rl.agent.advantages import paid_returns
 from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.beta.controller import BetaController
@@ -21,47 +21,47 @@ from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
 from mace_rl.numerics.finite import require_within
+from mace_rl.records import LARGEST_BETA
+from mace_rl.state import Stateful
 from mace_rl.streams import Streams
 
 # What a step's `info` gets, float.
 PARTS = ("reward_extrinsic", "reward_curiosity", "curiosity", "novelty", "relevance", "beta")
 
 
-LISTS = ("observations", "actions", "rewards", "bonus")  # of a `Recording`, in this order
-
-
 @dataclass
 class Recording:
-    """An episode that goes on: what was played, what it was worth, and at which rates."""
+    """An unfinished episode."""
 
     beta: float
     unit: float  # see `CuriosityTracker.unit`
-    visits: np.ndarray  # to each Discrete state so far, [observation]; of Box ones 0
-    observations: list[np.ndarray]  # the first, and what each step led to, float32 [observation]
+    visits: np.ndarray  # to each Discrete state so far, [observation]; 0 for Box ones
+    observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
     rewards: list[float] = field(default_factory=list)  # extrinsic
     bonus: list[float] = field(default_factory=list)  # R_curiosity
 
     def episode(self, terminated: bool) -> Episode:
-        """The episode as it was played; how likely its actions were is not known here."""
+        """The finished episode; the log-probabilities of its actions are unknown, NaN."""
         unknown = np.full(len(self.rewards), np.nan, np.float32)
         states, actions = np.stack(self.observations), np.array(self.actions)
         return Episode(states, actions, unknown, np.array(self.rewards), terminated)
 
     def state_dict(self) -> dict[str, Any]:
-        """Each part as a tensor."""
+        """Each part as one tensor."""
         return {name: torch.from_numpy(np.array(part)) for name, part in vars(self).items()}
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "Recording":
-        """The recording that `state_dict` was of."""
-        parts: dict[str, Any] = {name: part.numpy() for name, part in state.items()}
-        numbers = parts["beta"].item(), parts["unit"].item(), parts["visits"]
-        return cls(*numbers, *(list(parts[name]) for name in LISTS))
+    def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
+        """From the tensors of `state_dict` as arrays."""
+        beta, unit, visits, *lists = state.values()
+        return cls(beta.item(), unit.item(), visits, *map(list, lists))
 
 
-class CuriosityTracker:
-    """Appraises episodes of several environments while they go on."""
+class CuriosityTracker(Stateful):
+    """The curiosity bonus for unfinished episodes of several environments."""
+
+    STATE = ("curiosity", "controller", "scales", "recordings", "steps")
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
         self.config, self.spaces = config, spaces
@@ -72,27 +72,27 @@ class CuriosityTracker:
         self.controller = beta_rule(config.beta, streams["beta"])
         if isinstance(config.beta, CustomBeta):
             require_usable(config.beta.rule, self.controller, environments)
-        # Of the extrinsic rewards and of the curiosity bonus.
-        self.scales = RewardScale(config.discount, 1.0), RewardScale(config.discount, TINY)
+        smallest = {"extrinsic": 1.0, "curiosity": TINY}
+        self.scales = {kind: RewardScale(config.discount, x) for kind, x in smallest.items()}
         self.recordings: list[Recording | None] = [None] * environments
-        self.steps = 0  # since the agent's last update, of whole episodes
+        self.steps = 0  # of whole episodes since the agent's last update
 
     @property
     def unit(self) -> float:
-        """What 1 of R_curiosity is worth in extrinsic reward; 0 before any episode has ended."""
-        extrinsic, curiosity = self.scales
+        """The extrinsic reward that 1 of R_curiosity is worth; 0 before any episode has ended."""
+        extrinsic, curiosity = self.scales.values()
         return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
 
     def begin(self, environment: int, observation: Any) -> None:
-        """An episode begins; what was played of another is forgotten."""
+        """Start an episode; an unfinished one is forgotten."""
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
-        require_within("β", beta)
+        require_within("β", beta, largest=LARGEST_BETA)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
     def reward_parts(
         self, environment: int, action: Any, reward: Any, observation: Any
     ) -> dict[str, float]:
-        """`PARTS` of the reward for a step; reward: the extrinsic one; then what it led to."""
+        """`PARTS` of the reward for a step, from its extrinsic reward and next observation."""
         recording, space = self.recordings[environment], self.spaces.action_space
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
@@ -102,7 +102,7 @@ class CuriosityTracker:
         found = self.curiosity.appraise(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
-            require_within("the curiosity bonus", bonus, 1e-6)  # beyond that it is rounding
+            require_within("the curiosity bonus", bonus, rounding=1e-6)
             bonus = max(bonus, 0.0)
         if self.spaces.discrete_observations:
             recording.visits += state
@@ -118,16 +118,14 @@ class CuriosityTracker:
         return dict(zip(PARTS, values, strict=True))
 
     def end(self, environment: int, terminated: bool) -> None:
-        """The episode becomes memory, and β is set anew."""
+        """Finish an episode: it becomes memory, and β is set for the next."""
         recording = self.recordings[environment]
         assert recording is not None
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
-        for scale, rewards in zip(self.scales, (episode.rewards, bonus), strict=True):
-            scale.update(rewards)
-        values = np.zeros(len(episode) + 1)  # with λ = 1 only rewards are left: no critic
-        returns = generalised_advantages(episode.rewards, values, self.config.discount, 1.0)
-        self.curiosity.remember(episode, returns)
+        self.scales["extrinsic"].update(episode.rewards)
+        self.scales["curiosity"].update(bonus)
+        self.curiosity.remember(episode, paid_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
         if self.steps >= self.config.rollout_steps:
@@ -135,58 +133,41 @@ class CuriosityTracker:
             self.steps = 0
 
     def described(self) -> dict[str, Any]:
-        """What a state has to agree in with the one who loads it."""
+        """The settings that have to be the same where a state is loaded."""
         return {
-            **self.config.model_dump(exclude={"seed"}),  # drawn already
+            **self.config.model_dump(exclude={"seed"}),  # the generators are in the state
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 4,  # of the state itself
+            "form": 5,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """See `CuriosityReward`."""
-        state = {
-            "settings": self.described(),
-            "curiosity": self.curiosity.state_dict(),
-            "controller": self.controller.state_dict(),
-            "scales": [scale.state_dict() for scale in self.scales],
-            "recordings": [None if one is None else one.state_dict() for one in self.recordings],
-            "steps": self.steps,
-        }
-        return copy.deepcopy(state)  # the training may go on before this is saved
+        """As `CuriosityReward.state_dict` says."""
+        return super().state_dict() | {"settings": self.described()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `CuriosityReward`."""
+        """As `CuriosityReward.load_state_dict` says."""
         theirs, mine = state["settings"], self.described()
         for name in sorted(theirs.keys() | mine.keys()):
             if name not in theirs or name not in mine or theirs[name] != mine[name]:
-                then, now = (
-                    short_repr(x[name]) if name in x else "unknown" for x in (theirs, mine)
-                )
+                states = (theirs, mine)
+                then, now = (short_repr(x[name]) if name in x else "unknown" for x in states)
                 raise ConfigError(
                     f"the state to load was made with {name} {then}, but here it is {now}"
                 )
-        state = copy.deepcopy(state)
-        self.curiosity.load_state_dict(state["curiosity"])
-        self.controller.load_state_dict(state["controller"])
-        self.steps = state["steps"]
-        for scale, saved in zip(self.scales, state["scales"], strict=True):
-            scale.load_state_dict(saved)
-        self.recordings = [
-            None if saved is None else Recording.from_state(saved) for saved in state["recordings"]
-        ]
+        super().load_state_dict(copy.deepcopy(state))
+        found: list[Any] = self.recordings
+        self.recordings = [None if one is None else Recording.from_state(one) for one in found]
 
 
 def require_usable(rule: str, controller: BetaController, environments: int) -> None:
-    """Raise `ConfigError` for a rule of the user's own that asks for what a wrapper has not."""
+    """Raise `ConfigError` for a user's own rule that needs what a wrapper lacks."""
+    why = ""
     if controller.learns:
-        raise ConfigError(
-            f"beta.rule has {rule!r}, which learns from policy gradients, but only our trainer has "
-            "these"
-        )
-    if controller.one_at_a_time and environments > 1:
-        raise ConfigError(
-            f"beta.rule has {rule!r}, which learns from each episode before the next begins, but "
-            f"here {environments} go on at once: wrap each environment in a CuriosityReward"
-        )
+        why = "from policy gradients, but only our trainer has these"
+    elif controller.one_at_a_time and environments > 1:
+        why = f"from each episode before the next begins, but here {environments} go on at once: "
+        why += "wrap each environment in a CuriosityReward"
+    if why:
+        raise ConfigError(f"beta.rule has {rule!r}, which learns {why}")

@@ -1,7 +1,6 @@
-"""What an update did, for whoever wants to know why a run went as it did."""
+"""The diagnostics of an update, and a warning about observations that cannot be learned from."""
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -14,10 +13,9 @@ from mace_rl.records import UpdateRecord
 
 
 def unseen(normaliser: RunningNormaliser) -> list[int]:
-    """The dimensions of observations whose differences were, or would be, lost.
+    """The dimensions of observations whose differences are lost: tiny, or a few units of float32.
 
-    They count as constant in `RunningNormaliser`, or are a few units in the last place of float32.
-    What varies by float64's rounding is constant, which is suspect of large numbers only.
+    A dimension that varies only by float64's rounding is constant: suspect if it is large.
     """
     size = abs(normaliser.mean)
     deviation = np.sqrt(normaliser.sum_of_squares / normaliser.count)
@@ -36,25 +34,22 @@ def diagnose(
     done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
-    def stacked(arrays: Iterable[np.ndarray]) -> np.ndarray:
-        first, *others = arrays  # most rollouts are one episode
-        return np.concatenate([first, *others]) if others else first
+    def stacked(name: str) -> np.ndarray:
+        return np.concatenate([getattr(item, name) for item in rollout])
 
     def explained_variance(kind: str) -> float:
-        spread = variance(stacked(getattr(item, f"{kind}_returns") for item in rollout))
+        spread = variance(stacked(f"{kind}_returns"))
         # A return minus the critic's value is the advantage.
-        left = variance(stacked(getattr(item, f"{kind}_advantages") for item in rollout))
+        left = variance(stacked(f"{kind}_advantages"))
         return 1 - left / spread if spread > 0 else math.nan
 
     def mean_of(part: str) -> float:
-        if getattr(rollout[0].bonus, part) is None:  # a bonus that has no such part
+        if getattr(rollout[0].bonus, part, None) is None:  # plain PPO, or another bonus
             return math.nan
-        values = stacked(getattr(item.bonus, part) for item in rollout)
-        return mean(values)
+        return mean(np.concatenate([getattr(item.bonus, part) for item in rollout]))
 
     has_bonus = rollout[0].bonus is not None
-    own = stacked(item.extrinsic_part for item in rollout)
-    added = stacked(item.intrinsic_share for item in rollout)
+    own, added = stacked("extrinsic_part"), stacked("intrinsic_share")
     extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
@@ -71,8 +66,8 @@ def diagnose(
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),
         beta=sum(item.beta for item in rollout) / len(rollout),
         bonus_share=weighted / (extrinsic + weighted) if extrinsic + weighted > 0 else math.nan,
-        novelty=mean_of("novelty") if has_bonus else math.nan,
-        relevance=mean_of("relevance") if has_bonus else math.nan,
-        similarity=mean_of("similarity") if has_bonus else math.nan,
+        novelty=mean_of("novelty"),
+        relevance=mean_of("relevance"),
+        similarity=mean_of("similarity"),
         beta_credit=math.nan if credit is None else credit,
     )

@@ -1,4 +1,4 @@
-"""What an update learns from: episodes with their bonus, advantages and returns."""
+"""The rollout of an update: episodes with their bonus, advantages and returns."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +11,7 @@ from mace_rl.environments.rollout import Episode
 
 @dataclass(frozen=True)
 class Experience:
-    """An episode with all that the update needs of it; arrays are [T]."""
+    """An episode with all that the update needs; arrays are [T]."""
 
     episode: Episode
     observations: np.ndarray  # float32 [T + 1, observation], normalised as the networks see them
@@ -21,22 +21,22 @@ class Experience:
     extrinsic_returns: np.ndarray
     intrinsic_advantages: np.ndarray  # zeros without a bonus, like the next
     intrinsic_returns: np.ndarray
-    extrinsic_scale: float  # what the advantages are divided by where they are added up; or 1
+    extrinsic_scale: float  # `PPO.advantage_scale`, by which the advantages are divided
     intrinsic_scale: float
 
     @cached_property
     def extrinsic_part(self) -> np.ndarray:
-        """What the total advantage has of the extrinsic one: it, or in units of its scale."""
+        """A_E in the total advantage A_E + β A_I."""
         return self.extrinsic_advantages / self.extrinsic_scale
 
     @cached_property
     def intrinsic_part(self) -> np.ndarray:
-        """What β weighs in the total advantage: the intrinsic one, or in units of its scale."""
+        """A_I."""
         return self.intrinsic_advantages / self.intrinsic_scale
 
     @cached_property
     def intrinsic_share(self) -> np.ndarray:
-        """What β makes of it."""
+        """β A_I."""
         return self.beta * self.intrinsic_part
 
 
@@ -54,13 +54,3 @@ def joined(pieces: list[np.ndarray]) -> np.ndarray:
 def total_advantages(rollout: list[Experience]) -> np.ndarray:
     """A_E + β A_I of every step, float64 [N]."""
     return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
-
-
-def intrinsic_parts(rollout: list[Experience]) -> list[np.ndarray]:
-    """For each episode what `total_advantages` changes by with its β: A_I there, 0 elsewhere."""
-    parts = np.zeros((len(rollout), sum(len(item.episode) for item in rollout)))
-    start = 0
-    for part, item in zip(parts, rollout, strict=True):
-        part[start : start + len(item.episode)] = item.intrinsic_part
-        start += len(item.episode)
-    return list(parts)

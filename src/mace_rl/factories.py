@@ -1,4 +1,4 @@
-"""The parts of a run, made as its settings ask for: what sets β, the bonus, PPO."""
+"""The parts of a run, made from its settings: what sets β, the bonus, the environment, PPO."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +28,7 @@ from mace_rl.config.beta import (
 )
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
@@ -44,14 +44,14 @@ def beta_controller(
         case NoBonus():
             return None
         case MetaBeta(initial=initial):
-            assert config.meta is not None  # what a variant uses is there: `RunConfig`
-            return MetaAdaptation(config.meta, initial, environment, streams["meta"])
+            assert config.meta is not None  # `RunConfig` checked that
+            return MetaAdaptation(config.meta, initial, config.episodes)
         case rule:
             return beta_rule(rule, streams["beta"])
 
 
 def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
-    """What sets β without a network of ours."""
+    """What sets β, unless it is the meta network."""
     match settings:
         case ConstantBeta():
             return Constant(settings)
@@ -64,12 +64,12 @@ def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaControl
 def intrinsic_reward(
     config: RunConfig, environment: Environment, streams: Streams
 ) -> IntrinsicReward | None:
-    """What β weighs: the curiosity bonus with its memory and novelty, or another; None in PPO."""
+    """The bonus that β weighs: curiosity, or a user's own; None in plain PPO."""
     match config.bonus:
         case None:
             return None
         case CuriosityBonus():
-            assert config.novelty is not None  # as above
+            assert config.novelty is not None
             space, size = environment.observation_space, environment.observation_size
             return Curiosity(config.memory, config.novelty, space, size, streams)
         case CustomBonus(estimator=estimator, arguments=arguments):
@@ -77,20 +77,16 @@ def intrinsic_reward(
             return make(estimator, key, IntrinsicReward, False, *own, **arguments)
 
 
-def environment(config: RunConfig, streams: Streams) -> Environment:
-    """What the agent acts in."""
-    return Environment(
-        config.environment,
-        streams.sequence("environment"),
-        config.max_episode_steps,
-        config.environment_arguments,
-    )
+def environment(config: AgentConfig, streams: Streams) -> Environment:
+    """The environment that the agent acts in."""
+    limits = config.max_episode_steps, config.environment_arguments
+    return Environment(config.environment, streams.sequence("environment"), *limits)
 
 
 def actor_critic(
-    config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams
+    config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams
 ) -> ActorCritic:
-    """Policy and critics, one for each kind of reward, as training begins with them."""
+    """The untrained policy and critics, one for each kind of reward."""
     settings, size = config.ppo, spaces.observation_size
     own = settings.network if isinstance(settings.network, TorchModule) else None
 
@@ -104,7 +100,7 @@ def actor_critic(
     learner: type[Learner] = CompiledLearner
     if own is not None or config.engine == "torch":
         network, learner = TorchNetwork, TorchLearner
-    # A small last layer starts near the uniform policy, or at means near 0.
+    # With a small last layer the policy starts near uniform, or with means near 0.
     actor = network(module(spaces.action_size, 0.01, "actor"))
     policy = Policy(actor, spaces.action_space, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
@@ -112,6 +108,6 @@ def actor_critic(
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
 
 
-def ppo(config: RunConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
-    """Policy and critics, and what trains them."""
+def ppo(config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
+    """Policy and critics with their learner."""
     return PPO(actor_critic(config, spaces, intrinsic, streams), streams["minibatches"])

@@ -1,4 +1,4 @@
-"""The files of a run, and writing files so that neither a crash nor a reader finds half of one."""
+"""The files of a run, and how files are written and found."""
 
 import itertools
 import os
@@ -11,19 +11,19 @@ EPISODES = "episodes.csv"  # one row per training episode
 DIAGNOSTICS = "diagnostics.csv"  # one row per update
 AGENT = "agent.pt"  # the final weights
 RECORD = "run.json"  # configuration, versions, machine, digests; written last
-RESULTS = (EPISODES, DIAGNOSTICS, AGENT)  # what the same run has to give again, to the bit
-EVENTS = "events.out.tfevents.mace-rl"  # for TensorBoard, where they are asked for
+RESULTS = (EPISODES, DIAGNOSTICS, AGENT)  # equal to the bit if the run is repeated
+EVENTS = "events.out.tfevents.mace-rl"  # for TensorBoard
 
-CHECKPOINT = "checkpoint.pt"  # while it runs: from which it resumes ...
-PROGRESS = "progress.json"  # ... and for whoever watches
+CHECKPOINT = "checkpoint.pt"  # while the run trains: it resumes from this
+PROGRESS = "progress.json"  # while it trains: for `mace-rl status`
 LOCK = ".lock"  # held by the process that trains here; stays
 OF_A_RUN = (*RESULTS, PROGRESS, RECORD, CHECKPOINT)
 ASIDE = "_aside"  # and a number: folders in a run's, with earlier runs; no variant is named so
-PLAN = "logs/plan.json"  # of a results folder: its runs, as the workflow began them
+PLAN = "logs/plan.json"  # in a results folder: the runs that the workflow planned
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> None:
-    """Replace `path` by `content` (text as UTF-8); a reader or a crash finds all or none of it."""
+    """Replace `path` by `content` (text as UTF-8): readers and crashes find all or none of it."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -32,7 +32,7 @@ def write_atomically(path: str | Path, content: str | bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError as error:  # a full disk's does not say of which file
+    except OSError as error:  # that of a full disk does not name the file
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -51,7 +51,7 @@ def set_aside(folder: Path, names: Iterable[str]) -> Path:
 def runs_below(folder: Path, names: Collection[str]) -> list[Path]:
     """The folders in and below `folder` that have one of the files `names`, sorted; each once.
 
-    Folders behind links too, however they form loops. Not what `set_aside` made. Raises `OSError`
+    Links are followed, also in loops; folders that `set_aside` made are left out. Raises `OSError`
     for a folder that cannot be read.
     """
 
@@ -59,7 +59,7 @@ def runs_below(folder: Path, names: Collection[str]) -> list[Path]:
         raise error
 
     found, seen, roots = [], set(), [folder]
-    for root in roots:  # which grow: what is behind links comes after all else
+    for root in roots:  # the list grows: links come last
         for place, below, inside in os.walk(root, onerror=unreadable):
             below[:] = [name for name in below if not name.startswith(ASIDE)]
             if os.path.realpath(place) in seen:
@@ -73,6 +73,6 @@ def runs_below(folder: Path, names: Collection[str]) -> list[Path]:
 
 
 def require_ours(out: Path, begins: bytes) -> None:
-    """`Refusal` if there is something at `out` that does not begin as what is to replace it."""
+    """`Refusal` if there is something at `out` that does not begin with these bytes."""
     if out.is_dir() or (out.exists() and out.read_bytes()[: len(begins)] != begins):
         raise Refusal(f"{out}: there already, and not written by this command; choose another name")

@@ -1,4 +1,4 @@
-"""Training from a program of one's own: `settings` of a run, and `train`.
+"""Training from a program: `settings` of a run, and `train`.
 
 run = settings("CartPole-v1", "mace_full", seed=3, episodes=200, ppo={"clip": 0.1})
 agent, episodes = train(run, lambda episode: print(episode.extrinsic_return))
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Trained(NamedTuple):
-    """What came of a training."""
+    """The result of `train`."""
 
     agent: "Agent"  # as `load_agent` gives it
     episodes: list[EpisodeRecord]
@@ -42,10 +42,9 @@ def settings(
     variant: what sets β: "ppo" (no bonus), "mace_fixed", "mace_full", or one of `config`.
     config: YAML files like config.yaml. They may have further variants.
     changes: any field of `RunConfig`, such as episodes=200, max_episode_steps=100 or
-        beta={"kind": "constant", "value": 0.2}. Sections merge: ppo={"clip": 0.1} changes that
-        alone.
+        beta={"kind": "constant", "value": 0.2}. Sections merge, as in ppo={"clip": 0.1}.
 
-    Raises `ConfigError`, one line, for what cannot be.
+    Raises `ConfigError`, one line, for wrong settings.
     """
     over = [config] if isinstance(config, str | Path) else config
     study = read_study([DEFAULTS, *map(Path, over)], every_run=False)
@@ -68,13 +67,13 @@ def train(
     """Train to the last episode, in this process and on one thread.
 
     settings: from the function of that name.
-    callback: is called with each episode after the update that it was played for.
-    folder: keeps the run, as `mace-rl train --out` does: the same call goes on with what was
-        interrupted, without calling back for its episodes again, and only reads what is finished.
+    callback: is called with each episode after the update on it.
+    folder: keeps the run, as `mace-rl train --out` does. The same call resumes an interrupted run,
+        without calling back for its episodes again, and only reads a finished one.
     restart: move a run that is in `folder` into a folder below it, and train from the start.
 
     Raises `ConfigError` if `folder` has the results of another run, `RunError` if it has another
-    run unfinished or files of nobody's, and `NonFiniteError` as soon as a number goes bad.
+    unfinished run or other files, and `NonFiniteError` as soon as a number is NaN or infinite.
     """
     from mace_rl.runs.agent import load_agent  # torch takes seconds
     from mace_rl.runs.run import run

@@ -1,8 +1,4 @@
-"""Standard output and error that may be closed, or that nobody reads any more.
-
-A terminal hangs up, a pipe's reader ends, a disk fills up: what cannot be shown is dropped, since
-no training should end for it.
-"""
+"""Standard output and error that end no training if a terminal, a pipe or a disk fails."""
 
 import io
 import os
@@ -11,14 +7,13 @@ from typing import Any
 
 
 class Outlet(io.FileIO):
-    """Descriptor 1 or 2; from the first `error` on, what is written to it goes to /dev/null."""
+    """Descriptor 1 or 2; after its first `error` it is /dev/null."""
 
     error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Returns how many bytes are done with."""
         try:
-            written: int | None = super().write(data)  # None: it would have to wait
+            written: int | None = super().write(data)  # None: it would block
         except OSError as error:
             self.error, written = error, None
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
@@ -26,16 +21,16 @@ class Outlet(io.FileIO):
 
 
 def keep_open(descriptor: int) -> None:
-    """/dev/null for a closed one: the next file would get its number, and what C prints in it."""
+    """Open /dev/null in place of a closed descriptor: the next file would get its number."""
     try:
         os.fstat(descriptor)
     except OSError:
         os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
-        os.set_inheritable(descriptor, True)  # which dup2 does not of a number to itself
+        os.set_inheritable(descriptor, True)  # dup2 does not if it got this number itself
 
 
 def secure() -> None:
-    """Let no `print` to `sys.stdout` or `sys.stderr` fail, unless somebody has replaced them."""
+    """Replace `sys.stdout` and `sys.stderr` by `Outlet`s, unless the program has replaced them."""
     for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
         keep_open(descriptor)
         stream = getattr(sys, name)

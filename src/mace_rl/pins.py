@@ -1,12 +1,10 @@
-"""Which instructions libraries compute with: those that every x86-64 processor with AVX2 has.
+"""Make libraries use only the instructions that every x86-64 processor with AVX2 has.
 
-What trains compiled networks gives the same bits on every processor by construction
-(`agent.products`). Beside it stand libraries that look at the processor when they are loaded, and
-whose sums differ in the last bit: NumPy and OpenBLAS where tables and figures are made and where
-Hopper turns a vector, PyTorch where a network is a torch module of one's own. They can be told
-otherwise by variables that each reads once. Importing this module sets them, before any of these
-libraries is loaded, and Matplotlib's backend: the commands and the workflow do; `import mace_rl`
-alone does not.
+Compiled training gives the same bits on every processor by construction (`numerics.products`).
+NumPy, OpenBLAS and PyTorch, used for tables, figures, Hopper and torch modules of one's own, choose
+instructions by the processor, and their last bits differ. Importing this module before them sets
+the variables that restrict them, and Matplotlib's backend: the commands and the workflow do that,
+`import mace_rl` alone does not.
 """
 
 import os
@@ -23,10 +21,7 @@ PINS = {
 
 
 def pin() -> None:
-    """Set what the libraries read.
-
-    Not where the processor lacks AVX2: a library told to use it would end the process.
-    """
+    """Set the variables, unless the processor lacks AVX2: the libraries would end the process."""
     try:
         features = binding.get_host_cpu_features()
     except RuntimeError:  # LLVM does not know this kind of processor
@@ -35,5 +30,5 @@ def pin() -> None:
         os.environ.update(PINS)
 
 
-os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a notebook's backend need not be here
+os.environ["MPLBACKEND"] = "agg"  # draws files; a notebook's backend may not be installed here
 pin()

@@ -1,7 +1,6 @@
-"""`episodes.csv`: one row per training episode, and the only thing the results are computed from.
+"""`episodes.csv`: one row per training episode, of which all results are computed.
 
-A file that is not exactly what training writes is refused with one line that names the file and
-the line, because a damaged record would otherwise become a plausible number in Table 1.
+A damaged file is refused with its name and line, lest it become a plausible number in Table 1.
 """
 
 import csv
@@ -18,7 +17,9 @@ import numpy as np
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 
-if TYPE_CHECKING:  # pandas is imported where a frame is built: training only writes
+LARGEST_BETA = 10.0  # the paper has at most 1; larger constants are there to compare
+
+if TYPE_CHECKING:  # training only writes, without pandas
     import pandas as pd
 
 
@@ -55,7 +56,7 @@ class UpdateRecord:
     novelty: float  # mean over the rollout's steps, like the next two
     relevance: float
     similarity: float  # of a state to what the memory holds
-    beta_credit: float  # how the extrinsic return rose with the βs that could be judged
+    beta_credit: float  # mean credit of the βs judged in this update
 
 
 RunKey = tuple[str, str, int]  # environment, variant, seed
@@ -78,14 +79,12 @@ def as_columns(kind: type[Row], rows: Sequence[Row]) -> dict[str, np.ndarray]:
 
 
 def as_rows(kind: type[Row], columns: Mapping[str, np.ndarray]) -> list[Row]:
-    """What `as_columns` made columns of."""
+    """The rows of which `as_columns` made the columns."""
     values = zip(*(column.tolist() for column in columns.values()), strict=True)
     return [kind(**dict(zip(columns, row, strict=True))) for row in values]
 
 
-_BOUND = {int: 2**53, float: np.inf}  # of a number's size: an int is exact as a double
-
-
+_BOUND = {int: 2**53, float: np.inf}  # below which an int is exact as a double
 ALTERED = "missing, cut off or altered (SHA-256 not as in run.json)"
 
 
@@ -94,11 +93,7 @@ class RecordError(Refusal, ValueError):
 
 
 def write_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of `EpisodeRecord` (`as_columns`), atomically.
-
-    Doubles are written in the shortest form that reads back as the same double. Raises
-    `RecordError` for what no training could have produced, and `read_episodes` would refuse.
-    """
+    """Write `as_columns` of `EpisodeRecord`s, atomically; `RecordError` if they are impossible."""
     _check_episodes(path, columns)
     _write(path, columns)
 
@@ -109,17 +104,17 @@ def write_diagnostics(path: str | Path, rows: Sequence[UpdateRecord]) -> None:
 
 
 def _write(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    # `repr` is the shortest form that reads back as the same double.
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     lines = (",".join("" if value != value else repr(value) for value in row) for row in rows)
     write_atomically(path, "\n".join([",".join(columns), *lines]) + "\n")
 
 
 def read_episodes(path: str | Path, episodes: int, digest: str | None = None) -> "pd.DataFrame":
-    """Read the records of a finished run of `episodes` training episodes.
+    """The records of a finished run: a frame with the columns of `EpisodeRecord`, int64 or float64.
 
-    digest: the SHA-256 that `run.json` has of them. Returns a frame with the columns of
-    `EpisodeRecord` (int64 and float64) and one row per episode. Raises `RecordError` for a file
-    that `write_episodes` did not write in full, and for one with another digest.
+    episodes: how many there have to be; digest: the file's SHA-256 in `run.json`. Raises
+    `RecordError` for a file that `write_episodes` did not write in full, or with another digest.
     """
     columns = get_type_hints(EpisodeRecord)
     frame = read_table(path, columns, digest)
@@ -135,11 +130,10 @@ def read_episodes(path: str | Path, episodes: int, digest: str | None = None) ->
 def read_table(
     path: str | Path, columns: Mapping[str, type], digest: str | None = None
 ) -> "pd.DataFrame":
-    """A CSV file with a header of exactly `columns`, each of them int, float or str, as a frame.
+    """A CSV file with exactly the `columns`, each int, float or str, as a frame.
 
-    Raises `RecordError` for a file that is missing, cut off, or not what writing its rows would
-    give again, to the byte (`pandas.read_csv` would make something of most of these), and for one
-    whose SHA-256 is not `digest`.
+    Raises `RecordError` unless its rows would be written like this to the byte, or if its SHA-256
+    is not `digest`.
     """
     import pandas as pd
 
@@ -167,7 +161,7 @@ def read_table(
             and _text(frame) == content
         )
     except (ValueError, OverflowError, csv.Error):
-        whole = False  # the first line that is wrong is named below
+        whole = False  # the first wrong line is named below
     if whole and digest and not known:
         raise RecordError(f"{path}: {ALTERED}")
     if whole:
@@ -185,14 +179,14 @@ def read_table(
 
 
 def _text(frame: "pd.DataFrame") -> bytes:
-    """What `frame.to_csv` gives without quotes and index, in half the time."""
+    """`frame.to_csv` without quotes and index, in half the time."""
     cells = (map(str, column.tolist()) for _, column in frame.items())
     rows = map(",".join, zip(*cells, strict=True))
     return "\n".join([",".join(map(str, frame)), *rows, ""]).encode()
 
 
 def _parse(cell: str, kind: type, name: str) -> int | float | str:
-    """One cell as `kind`; ValueError with column and cell if it would not be written like this."""
+    """One cell as `kind`; `ValueError` with column and cell if it would be written otherwise."""
     try:
         value = kind(cell)
     except ValueError:
@@ -205,30 +199,18 @@ def _parse(cell: str, kind: type, name: str) -> int | float | str:
 
 def _check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """Refuse rows that no training could have produced; `columns` hold arrays [episodes]."""
-    rules = (  # column, whether each row is right [episodes], what would be right
-        (
-            "episode",
-            columns["episode"] == np.arange(len(columns["episode"])) + 1,
-            "the next number",
-        ),
-        ("length", columns["length"] >= 1, "at least 1"),
-        (
-            "env_steps",
-            columns["env_steps"] == np.cumsum(columns["length"]),
-            "the sum of the lengths so far",
-        ),
-        ("extrinsic_return", np.isfinite(columns["extrinsic_return"]), "finite"),
-        ("intrinsic_return", _within(columns["intrinsic_return"], 0, np.inf), "finite and >= 0"),
-        ("beta", _within(columns["beta"], 0, 1), "in [0, 1]"),
-        ("terminated", _within(columns["terminated"], 0, 1), "0 or 1"),
-    )
-    wrong = [(int(np.argmin(right)), name, wish) for name, right, wish in rules if not right.all()]
+    (number, steps, length, returns, bonus, beta, ended) = columns.values()
+    rules = {  # whether each row is right, [episodes], and what would be right
+        "episode": (number == np.arange(len(number)) + 1, "the next number"),
+        "length": (length >= 1, "at least 1"),
+        "env_steps": (steps == np.cumsum(length), "the sum of the lengths so far"),
+        "extrinsic_return": (np.isfinite(returns), "finite"),
+        "intrinsic_return": (np.isfinite(bonus) & (bonus >= 0), "finite and >= 0"),
+        "beta": ((beta >= 0) & (beta <= LARGEST_BETA), f"in [0, {LARGEST_BETA:g}]"),
+        "terminated": ((ended >= 0) & (ended <= 1), "0 or 1"),
+    }
+    wrong = [(int(np.argmin(fits)), name) for name, (fits, _) in rules.items() if not fits.all()]
     if wrong:
-        row, name, wish = min(wrong, key=lambda found: found[0])
+        row, name = min(wrong, key=lambda found: found[0])
         value = columns[name][row].item()
-        raise RecordError(f"{path}: line {row + 2}: {name} is {value!r}, not {wish}")
-
-
-def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Whether each value [n] is finite and in [low, high]."""
-    return np.isfinite(values) & (values >= low) & (values <= high)
+        raise RecordError(f"{path}: line {row + 2}: {name} is {value!r}, not {rules[name][1]}")

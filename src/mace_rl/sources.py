@@ -1,9 +1,8 @@
 """The content of the source files that a result depends on, as one digest.
 
-What Snakemake lacks (9.27.1): edit `src/mace_rl/agent/ppo.py` after a study, and it has "Nothing to
-be done", since it looks into scripts but not into what they import; and of a declared input it
-records what the file contained when the job *ended*. So the workflow hands each job the digest of
-the rooms that it works in, as they are when it is planned.
+What Snakemake lacks (9.27.1): it looks into scripts but not into what they import, so after an edit
+of `src/mace_rl/agent/ppo.py` it has "Nothing to be done". Of a declared input it records the
+content when the job *ended*. So the workflow gives each job the digest at planning.
 """
 
 import hashlib
@@ -21,10 +20,9 @@ NO_PART = (
 
 
 def digest(part: str, *own: Path) -> str:
-    """SHA-256 over names and contents of what "training" depends on, or of "everything".
+    """SHA-256 of the names and contents of `files(part)` and of `own`.
 
-    own: files beside this package that count too, such as a script or code of the user's own, but
-    not what they import in their turn.
+    own: files outside this package that count too, such as the user's, without their imports.
     """
     lines = sorted([*_lines(part), *map(_line, own)])
     return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -32,22 +30,17 @@ def digest(part: str, *own: Path) -> str:
 
 def files(part: str) -> list[Path]:
     """The source files of this package: "everything", or what a "training" depends on."""
-    left_out = [PACKAGE / name for name in NO_PART] if part == "training" else []
-    return sorted(
-        file for file in PACKAGE.rglob("*.py") if not {file, *file.parents}.intersection(left_out)
-    )
+    left_out = {PACKAGE / name for name in NO_PART} if part == "training" else set()
+    found = [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.npz")]  # the meta network's weights
+    return sorted(file for file in found if left_out.isdisjoint({file, *file.parents}))
 
 
-@cache  # of code that is imported, and so stays in this process what it was
+@cache  # the code in this process is what it was when it was imported
 def _lines(part: str) -> list[str]:
     return [_line(file) for file in files(part)]
 
 
 def _line(file: Path) -> str:
-    return f"{_label(file)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n"
-
-
-def _label(file: Path) -> str:
-    """The file's place in this package, or its folder and name: the same wherever both lie."""
-    inside = file.is_relative_to(PACKAGE)
-    return str(file.relative_to(PACKAGE.parent)) if inside else f"{file.parent.name}/{file.name}"
+    inside = file.is_relative_to(PACKAGE)  # its label is the same wherever the package lies
+    label = file.relative_to(PACKAGE.parent) if inside else f"{file.parent.name}/{file.name}"
+    return f"{label} {hashlib.sha256(file.read_bytes()).hexdigest()}\n"

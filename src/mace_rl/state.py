@@ -1,6 +1,7 @@
-"""What a checkpoint holds of an object: the attributes that it names."""
+"""Objects whose state is in checkpoints: the attributes that they name."""
 
 import copy
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import Any
 
@@ -8,17 +9,28 @@ import numpy as np
 import torch
 
 
-class Stateful:
+class HasState(ABC):
+    """An interface of parts whose state is in checkpoints."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class Stateful(HasState):
     """`STATE` names the attributes that the rest of a run depends on.
 
-    Arrays, numbers, None, NumPy's generators, what has a `state_dict` of its own; and lists, deques
-    and dictionaries of these.
+    They are arrays, numbers, None, NumPy's generators, objects with a `state_dict`, and lists,
+    deques and dictionaries of these.
     """
 
     STATE: tuple[str, ...] = ()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
         return {name: saved(getattr(self, name)) for name in self.STATE}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -44,7 +56,7 @@ def saved(value: Any) -> Any:
 
 
 def restored(current: Any, state: Any) -> Any:
-    """What `saved` made `state` of, to take the place of `current`, which may be it, changed."""
+    """The value that `saved` made `state` of, to replace `current`; where possible it, changed."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current

@@ -1,25 +1,14 @@
 """One independent random stream per component, so that no component disturbs another's draws.
 
-This is what makes β = 0 equal to plain PPO to the bit: memory, novelty and the meta network draw
-from streams of their own.
+So β = 0 equals plain PPO to the bit: memory and novelty draw from streams of their own.
 """
 
 import numpy as np
 
-# Order matters: a stream's place is its key. New streams go at the end.
+# A stream's place here is its key, so new streams go at the end.
 STREAMS = (
-    "environment",
-    "actions",
-    "minibatches",
-    "actor",
-    "extrinsic_critic",
-    "intrinsic_critic",
-    "density",
-    "density_batches",
-    "meta",
-    "novelty",
-    "beta",
-    "bonus",
+    *("environment", "actions", "minibatches", "actor", "extrinsic_critic", "intrinsic_critic"),
+    *("density", "density_batches", "meta", "novelty", "beta", "bonus"),  # meta: not drawn from
 )
 
 
@@ -30,9 +19,9 @@ class Streams:
         self.seed = seed
 
     def sequence(self, stream: str) -> np.random.SeedSequence:
-        """The seed sequence of `stream`, one of `STREAMS`."""
+        """The seed sequence of a stream."""
         return np.random.SeedSequence(entropy=self.seed, spawn_key=(STREAMS.index(stream),))
 
     def __getitem__(self, stream: str) -> np.random.Generator:
-        """A new generator for `stream`, at its beginning."""
+        """A new generator at the stream's beginning."""
         return np.random.default_rng(self.sequence(stream))

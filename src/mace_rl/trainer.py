@@ -16,24 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import normalised, normalised_change
+from mace_rl.agent.advantages import normalised, normalised_change, paid_returns
 from mace_rl.agent.learner import Batch, Update
 from mace_rl.beta.controller import Effect
 from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import (
-    Experience,
-    intrinsic_parts,
-    joined,
-    steps,
-    total_advantages,
-)
+from mace_rl.experience import Experience, joined, steps, total_advantages
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
-from mace_rl.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
+from mace_rl.records import LARGEST_BETA, EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.refusal import Refusal
 from mace_rl.streams import Streams
 
@@ -116,7 +110,7 @@ class Trainer:
         reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta = float(numbers("β", self.controller.beta, ()))
-            require_within("β", beta)
+            require_within("β", beta, largest=LARGEST_BETA)
             bonus = self.curiosity.bonus(episode)
             reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
             largest = min(self.curiosity.largest, TOO_LARGE)
@@ -126,7 +120,8 @@ class Trainer:
                 "intrinsic", observations, reward, episode.terminated
             )
             intrinsic_scale = self.ppo.advantage_scale("intrinsic")
-            self.curiosity.remember(episode, extrinsic_returns * self.ppo.reward_scale("extrinsic"))
+            paid = paid_returns(episode.rewards, self.config.ppo.discount)
+            self.curiosity.remember(episode, paid)
             self.controller.next_episode(episode, reward)
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
@@ -154,30 +149,26 @@ class Trainer:
         )
 
     def adapt(self, rollout: list[Experience]) -> float | None:
-        """Meta-adaptation: tell the controller what each β changes in the update, before it.
+        """Meta-adaptation: tell the controller what β changes in the update, before it.
 
         The update steps along the policy gradient g of the normalised total advantage, as Adam
-        preconditions it. Shown are dg/dβ of each episode, preconditioned alike, and g_E, that of
-        the extrinsic advantage. Returns the credit of earlier βs, None if there is none.
+        preconditions it. Shown are dg/dβ, preconditioned alike, and g_E, that of the extrinsic
+        advantage. Returns the credit of an earlier β, None if there is none.
         """
         if self.controller is None:
             return None
         self.controller.end_rollout()
         if not self.controller.learns:
             return None
-        centred = self.config.ppo.centre_advantages
+        centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
         extrinsic = np.concatenate([item.extrinsic_part for item in rollout])
+        intrinsic = np.concatenate([item.intrinsic_part for item in rollout])
         if centred:
             extrinsic -= mean(extrinsic)
-        total = total_advantages(rollout)
-        changes = [normalised_change(total, part, centred) for part in intrinsic_parts(rollout)]
-        learner = self.ppo.learner
-        gradient, *changes = learner.policy_gradients(*steps(rollout), [extrinsic, *changes])
-        effects = [
-            Effect(learner.preconditioned(change), root_mean_square(item.intrinsic_part))
-            for change, item in zip(changes, rollout, strict=True)
-        ]
-        return self.controller.learn(gradient, root_mean_square(extrinsic), effects)
+        change = normalised_change(total_advantages(rollout), intrinsic, centred)
+        gradient, change = learner.policy_gradients(*steps(rollout), [extrinsic, change])
+        effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
+        return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""

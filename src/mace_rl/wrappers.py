@@ -4,15 +4,15 @@
 
     reward = R_extrinsic + β · u · R_curiosity,      u = s_E / s_I
 
-R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages, each in units of
-their scale; a wrapper sees rewards only. So u brings the bonus to the unit of the extrinsic reward,
-which is left as it is: s_E and s_I are the standard deviations of the discounted sums of either
-reward in all episodes so far (`RewardScale`), s_E at least 1. β = 0.4 hence means that what the
-bonus adds up to varies 0.4 times as much as what the environment pays, or as 1 if that varies less.
+R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages in units of their
+scale; a wrapper sees rewards only, and leaves the extrinsic one as it is. So u brings the bonus to
+its unit: s_E and s_I are the standard deviations of the discounted sums of either reward in all
+episodes so far (`RewardScale`), s_E at least 1. With β = 0.4 the sums of the bonus vary 0.4 times
+as much as those of the extrinsic reward, or 0.4 if these vary by less than 1.
 
-β and u belong to an episode and hold from its beginning to its end. With it the episode becomes
-memory, all novelty is updated, and β is set anew. Before the first end u is not known: it is 0, and
-nothing is paid yet. From an episode that is reset before it ends nothing is learned.
+β and u are constant during an episode. At its end the episode becomes memory, novelty is updated,
+and β and u are set for the next. In the first episode u is 0: no bonus is paid yet. An episode that
+is reset before it ends is forgotten.
 """
 
 from collections.abc import Mapping
@@ -63,10 +63,10 @@ class CuriosityMixin(RecordConstructorArgs):
         self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the rest of a training depends on here, unfinished episode included.
+        """Everything that the bonus depends on, the unfinished episode included.
 
         Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
-        `weights_only`. The environment's and the agent's state are not in it.
+        `weights_only`. The states of the environment and the agent are not in it.
         """
         return self.tracker.state_dict()
 
@@ -78,33 +78,31 @@ class CuriosityMixin(RecordConstructorArgs):
 class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
-    env: observations are arrays of one shape (Box; they are flattened) or Discrete, actions are
-        Discrete or one-dimensional; Gymnasium's `FlattenObservation` makes vectors of others. Its
-        episodes have to end, if need be by a time limit: nothing is learned from one that does not.
-    beta: a number in [0, 1], or a rule that sets β for each episode, as in config.yaml: {"kind":
-        "exponential", …} or "custom". Not "meta", which learns from policy gradients.
-    relevance: False for novelty alone, without the memory, whose settings are refused then.
-    memory, novelty: what differs from the study's settings (`mace_rl.config.wrappers`), by name.
+    env: observations are Box (flattened) or Discrete, actions Discrete or one-dimensional Box;
+        Gymnasium's `FlattenObservation` makes vectors of others. Episodes have to end, if need be
+        by a time limit: nothing is learned from one that does not.
+    beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
+        "exponential", …} or "custom". Not "meta", which asks for policy gradients.
+    relevance: False for novelty alone, without memory; `memory` is then refused.
+    memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
     discount: γ of the agent (gamma in stable-baselines3), per step.
-    rollout_steps: steps between the agent's updates (n_steps there), for rules that want to know.
-    seed: of what is drawn here; `reset(seed=…)` is the environment's.
+    rollout_steps: steps between the agent's updates (n_steps there), for rules that ask.
+    seed: of the bonus's random numbers; `reset(seed=…)` is the environment's.
 
     `info` of a step gets `PARTS`, each a float: `reward_extrinsic` and `reward_curiosity`, whose
     sum is the reward, in the environment's unit; R_curiosity in [0, 1], as `curiosity`, with its
     factors `novelty` and `relevance`; and `beta`.
 
-    Memory holds the discounted return-to-go of each state until the episode ended. The trainer's
-    λ-returns take a critic: here what a time limit cut off counts as nothing.
+    Memory holds the discounted return-to-go of each state to the end of its episode. There is no
+    critic as in the trainer: nothing is added beyond a time limit.
 
-    Raises `ConfigError`, one line, for settings and spaces that do not work and observations that
-    are not of their space's size, and `NonFiniteError` for a reward, an observation or a bonus that
-    is not a number.
+    Raises `ConfigError`, one line, for settings and spaces that do not work and observations of
+    another size, and `NonFiniteError` for rewards, observations or bonuses that are not numbers.
     """
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """The environment's reset."""
         observation, info = self.env.reset(seed=seed, options=options)
         self.tracker.begin(0, observation)
         return observation, info
@@ -121,12 +119,12 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
 
 # Gymnasium's class takes no types as arguments before its version 1.3.
 class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
-    """`CuriosityReward` for environments that are stepped together and share what is known.
+    """`CuriosityReward` for environments that are stepped together and share memory and novelty.
 
-    What was seen in one of them is known in all as soon as its episode has ended. Arguments are
-    those of `CuriosityReward`; what it adds to `info` are arrays here, float64 [environments], with
-    Gymnasium's masks: nothing is paid where an environment was only reset. All modes of autoreset
-    work. Of a step that ended an episode, what was paid stands in `infos`, not in `final_info`.
+    An episode in one of them is known in all as soon as it has ended. Arguments are those of
+    `CuriosityReward`. Its entries of `info` are arrays, float64 [environments], with Gymnasium's
+    masks: an environment that was only reset gets no bonus. All modes of autoreset work. The
+    entries for the last step of an episode are in `infos`, not in `final_info`.
     """
 
     def reset(
@@ -164,7 +162,7 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
 
 
 def given(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The settings among a constructor's arguments; of memory and novelty None is none."""
+    """The settings among a constructor's arguments, without memory or novelty if None."""
     omitted = [name for name in ("memory", "novelty") if arguments[name] is None]
     return {name: arguments[name] for name in CuriosityConfig.model_fields if name not in omitted}
 

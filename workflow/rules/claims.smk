@@ -13,9 +13,8 @@ rule claims:
     log:
         f"{RESULTS}/logs/claims.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         command=COMMAND,
-        code=code("evaluate.py", MEASURED),
+        code=code("claims.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/claims.py"

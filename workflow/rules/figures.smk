@@ -21,19 +21,21 @@ rule figure:
         number="1|2",
     params:
         runs=TRAININGS,
-        layout=study.figure.model_dump(),
         settings=study.metrics.model_dump(exclude={"custom"}),
-        labels=study.labels,
-        colours=study.colours,
-        code=code("evaluate.py"),
+        style=STYLE,
+        code=code("figure.py"),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/figure.py"
 
 
-# Of all runs at once: `PICTURES` of mace_rl.study.show.pictures, those of other data below.
+# Of all runs at once, or of the ledger: `PICTURES` of mace_rl.study.show.pictures.
 rule picture:
     input:
-        metrics=f"{RESULTS}/metrics.csv",
+        unpack(
+            lambda wildcards: (
+                LEDGER if wildcards.picture == "forest" else {"metrics": f"{RESULTS}/metrics.csv"}
+            )
+        ),
         claims=CLAIMS,
     output:
         data=f"{RESULTS}/{{picture}}.csv",
@@ -44,48 +46,32 @@ rule picture:
     log:
         f"{RESULTS}/logs/{{picture}}.log",
     wildcard_constraints:
-        picture="every_seed|constants|solved",
+        picture="every_seed|constants|solved|forest",
     params:
-        runs=TRAININGS,
-        layout=study.figure.model_dump(),
-        settings=MEASURED.model_dump(),
-        labels=study.labels,
-        colours=study.colours,
-        code=code("evaluate.py", MEASURED),
+        **RUNS_MEASURED,
+        style=STYLE,
+        code=code("picture.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/picture.py"
 
 
-if LEDGER:
-
-    localrules:
-        forest,
-
-    use rule picture as forest with:
-        input:
-            **LEDGER,
-            claims=CLAIMS,
-        wildcard_constraints:
-            picture="forest",
-
-
-if READ:
-
-    localrules:
-        readings,
-
-    use rule picture as readings with:
-        input:
-            episodes=EPISODES,
-            records=RECORDS,
-            claims=CLAIMS,
-        output:  # the PNG first: a figure that is laid out once more is a little different
-            data=f"{RESULTS}/{{picture}}.csv",
-            png=report(
-                f"{RESULTS}/{{picture}}.png",
-                caption="../report/picture.rst",
-                category="Supplement",
-            ),
-            pdf=f"{RESULTS}/{{picture}}.pdf",
-        wildcard_constraints:
-            picture="readings",
+# Seconds of work that only Table 1 is worth.
+rule readings:
+    input:
+        records=RECORDS,
+        episodes=EPISODES,
+        claims=CLAIMS,
+    output:
+        data=f"{RESULTS}/readings.csv",
+        pdf=f"{RESULTS}/readings.pdf",
+        png=report(
+            f"{RESULTS}/readings.png", caption="../report/picture.rst", category="Supplement"
+        ),
+    log:
+        f"{RESULTS}/logs/readings.log",
+    params:
+        **RUNS_MEASURED,
+        style=STYLE,
+        code=code("readings.py", MEASURED),
+    script:
+        "../scripts/readings.py"

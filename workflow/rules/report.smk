@@ -3,44 +3,33 @@
 
 from mace_rl.sources import PACKAGE
 
-REPORTED = {
-    **{
-        name: f"{RESULTS}/{name}.csv"
-        for name in (
-            *("metrics", "betas", "table1", "supplement", "comparisons", "aggregate"),
-            *("figure1", "figure1_seeds", "figure2", "figure2_seeds", *READ),
-        )
-    },
-    "records": RECORDS,
-    # To these the page refers.
-    "in_print": [f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
-}
+PICTURED = ["figure1", "figure1_seeds", "figure2", "figure2_seeds", *READ]
 
 
 # The agents that are shown are no inputs: where runs are kept without them, the page says so. Each
 # run.json, which is an input, has its agent's digest.
 rule page:
     input:
-        **REPORTED,
+        **csv(*TABULATED, *PICTURED),
         **LEDGER,
         claims=CLAIMS,
+        records=RECORDS,
+        # To these the page refers.
+        in_print=[f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
     output:
         f"{RESULTS}/report.html",
     log:
         f"{RESULTS}/logs/report.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
-        labels=study.labels,
-        colours=study.colours,
+        **RUNS_MEASURED,
+        style=STYLE | {"layout": {"columns": 3}},
         command=COMMAND,
-        layout={"columns": 3},
         configuration={
             file: Path(file).read_text(encoding="utf-8") for file in (*config_files, CLAIMS)
         },
         ppo=ppo_settings(),
         own=own_code(),
         template=provenance.file_digest(PACKAGE / "study" / "show" / "report.html"),
-        code=code("evaluate.py", MEASURED),
+        code=code("page.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/page.py"

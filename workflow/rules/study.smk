@@ -70,6 +70,13 @@ COMMAND += ["--configfile", *config_files[1:]] if config_files[1:] else []
 COMMAND += ["--config", *GIVEN] if GIVEN else []
 COMMAND = shlex.join(COMMAND)
 TRAININGS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # with how many episodes
+RUNS_MEASURED = {"runs": TRAININGS, "settings": MEASURED.model_dump()}
+STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours": study.colours}
+
+
+def csv(*names):
+    """Data of the study, by the names of their files."""
+    return {name: f"{RESULTS}/{name}.csv" for name in names}
 
 
 def one_of(values):

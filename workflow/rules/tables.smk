@@ -12,11 +12,10 @@ rule metrics:
     log:
         f"{RESULTS}/logs/metrics.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
-        code=code("evaluate.py", MEASURED),
+        **RUNS_MEASURED,
+        code=code("metrics.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/metrics.py"
 
 
 SUPPLEMENT = {
@@ -38,12 +37,11 @@ rule tables:
     log:
         f"{RESULTS}/logs/tables.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         labels=study.labels,
-        code=code("evaluate.py", MEASURED),
+        code=code("tables.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/tables.py"
 
 
 rule table2:
@@ -55,21 +53,19 @@ rule table2:
         f"{RESULTS}/logs/table2.log",
     params:
         ppo=ppo_settings(),
-        code=code("evaluate.py"),
+        code=code("table2.py"),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/table2.py"
 
 
 TABULATED = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
-TABULATED += (
-    ["readings"] if READ and HAS_PAPERS else []
-)  # seconds of work that only Table 1 is worth
+TABULATED += READ if HAS_PAPERS else []  # seconds of work that only Table 1 is worth
 
 
 # The pictures are no inputs: the page only names them.
 rule tables_page:
     input:
-        **{name: f"{RESULTS}/{name}.csv" for name in TABULATED},
+        **csv(*TABULATED),
         **LEDGER,
         claims=CLAIMS,
     output:
@@ -77,10 +73,9 @@ rule tables_page:
     log:
         f"{RESULTS}/logs/tables_page.log",
     params:
-        runs=TRAININGS,
-        settings=MEASURED.model_dump(),
+        **RUNS_MEASURED,
         pictures=["figure1", "figure2", *PICTURES, *READ],
         command=COMMAND,
-        code=code("evaluate.py", MEASURED),
+        code=code("tables_page.py", MEASURED),
     script:
-        "../scripts/evaluate.py"
+        "../scripts/tables_page.py"

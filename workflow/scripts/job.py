@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from mace_rl import outlets
 
@@ -18,18 +19,19 @@ logger = logging.getLogger("job")
 
 
 @contextmanager
-def job(title: str, log: str) -> Iterator[None]:
-    """Carry out the body as the job `title`.
+def job(snakemake: Any) -> Iterator[None]:
+    """Carry out the body as the job that Snakemake's object of that name describes.
 
-    Standard output and error, those of compiled libraries too, are appended to the file `log`. If
+    Standard output and error, those of compiled libraries too, are appended to the job's log. If
     the body raises, the process exits with 1; then the log has the traceback and, in its last line,
     which workflow/rules/terminal.smk shows, the reason.
     """
+    title = " ".join([snakemake.rule, *snakemake.wildcards])
     # Without this a training goes on unseen when Snakemake is killed.
     if "MACE_RL_SNAKEMAKE_PID" in os.environ:
         threading.Thread(target=_end_with_snakemake, daemon=True).start()
     outlets.secure()  # or the log gets the number of one that is closed
-    with open(log, "a", encoding="utf-8") as file:
+    with open(snakemake.log[0], "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     logging.basicConfig(

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from job import job
 
-run_of = snakemake.wildcards
-with job(f"training {run_of.env}, {run_of.variant}, seed {run_of.seed}", snakemake.log[0]):
+with job(snakemake):
     from mace_rl.config.run import RunConfig
     from mace_rl.runs.run import run
 

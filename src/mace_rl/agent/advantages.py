@@ -26,13 +26,19 @@ def generalised_advantages(
     return result
 
 
+def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
+    """The discounted return-to-go of each step as it was paid, [T].
+
+    Without what a critic guesses for the rest, which early on differs by more than what is paid.
+    """
+    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)
+
+
 @kernel
 def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
     """Advantages with root mean square 1, float64 [N]; if `centred`, with mean 0 too.
 
-    A rollout is often one episode. To centre it is to forget whether it went better or worse than
-    expected as a whole, and to blow up what is left, which in an episode that went well all the way
-    is noise.
+    Centring a rollout of one episode forgets whether the whole went better than expected.
     """
     if centred:
         advantages = advantages - mean(advantages)
@@ -41,10 +47,7 @@ def normalised(advantages: np.ndarray, centred: bool) -> np.ndarray:
 
 @kernel
 def normalised_change(advantages: np.ndarray, change: np.ndarray, centred: bool) -> np.ndarray:
-    """d normalised(advantages + ε · change) / dε at ε = 0, [N].
-
-    What of the change is parallel to the advantages is lost in the normalisation.
-    """
+    """d normalised(advantages + ε · change) / dε at ε = 0, [N]."""
     if centred:
         advantages, change = advantages - mean(advantages), change - mean(change)
     spread = root_mean_square(advantages) + 1e-8

@@ -1,9 +1,7 @@
 """PPO's update in compiled code: K epochs over the minibatches in one call for each network.
 
-It computes what `TorchLearner` does, by gradients written out. That of a minibatch is a sum over
-its steps, in order. `products` continue a sum where it was left, so the steps go through the
-network in blocks that fit into the processor's nearest cache, with the bits that all at once would
-have.
+It computes what `TorchLearner` does, with gradients written out. A minibatch goes through the
+network in blocks that fit into the nearest cache: `products` continue the sum over steps.
 """
 
 from collections.abc import Mapping
@@ -29,14 +27,13 @@ BLOCK = 64  # steps; 32 to 128 are as fast
 
 
 class CompiledLearner(Stateful):
-    """See `Learner`; for tanh networks."""
+    """A `Learner` for policies and critics of `CompiledMLP`."""
 
-    STATE = ("optimisers",)  # which have the parameters
+    STATE = ("optimisers",)  # they hold the parameters
 
     def __init__(
         self, config: PPOConfig, policy: Policy, critics: Mapping[str, CompiledMLP]
     ) -> None:
-        """policy: of a `CompiledMLP`, too."""
         self.config, self.policy, self.critics = config, policy, critics
         self.network = cast(CompiledMLP, policy.network)
         rates = dict.fromkeys(critics, config.critic_learning_rate)
@@ -49,13 +46,12 @@ class CompiledLearner(Stateful):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """See `Learner`."""
         return CompiledActing.of(cast(CompiledMLP, policy.network), policy.log_std, normalisation)
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
     ) -> Update:
-        """See `Learner`: each network goes through all epochs before the next one."""
+        """As `Learner` says: each network goes through all epochs before the next one."""
         adam = {name: optimiser.state for name, optimiser in self.optimisers.items()}
         sizes, loss = self.network.sizes, (self.config.clip, self.config.entropy_coefficient)
         norm, log_probs, entropies = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
@@ -68,14 +64,12 @@ class CompiledLearner(Stateful):
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """See `Learner`."""
         weights = np.stack([item / len(item) for item in advantages]).astype(np.float32)
         observations = np.ascontiguousarray(observations, np.float32)
         network, parameters = self.network, self.policy.parameters
         return list(policy_gradients(observations, actions, weights, parameters, network.sizes))
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """See `Learner`."""
         return self.optimisers["actor"].preconditioned(direction)
 
 
@@ -85,8 +79,8 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
 
     steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
 
-    Returns the last minibatch's gradient norm; and of the last epoch's steps, in its order, each as
-    its minibatch was learnt from, log π(a|s), float32 [N], and the policy's entropy, [N].
+    Returns the last minibatch's gradient norm, and for the steps of the last epoch in its order,
+    before each minibatch's update, log π(a|s), float32 [N], and the policy's entropy, [N].
     """
     parameters, count = adam.parameters, len(steps.advantages)
     log_std = own_part(parameters, sizes)
@@ -117,10 +111,7 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
 
 @kernel
 def improve_values(observations, returns, minibatches, sizes, adam):
-    """Descend the mean squared error of V(s) against the λ-returns, float32 [N].
-
-    The other arguments as in `improve_policy`. Returns the last minibatch's gradient norm.
-    """
+    """`improve_policy` for V(s), by the mean squared error against the λ-returns, float32 [N]."""
     parameters = adam.parameters
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradient, norm = np.empty_like(parameters), 0.0
@@ -144,10 +135,7 @@ def improve_values(observations, returns, minibatches, sizes, adam):
 
 @kernel
 def policy_gradients(observations, actions, weights, parameters, sizes):
-    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n].
-
-    parameters: a `Policy`'s; the other arguments as in `improve_policy`.
-    """
+    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n]."""
     log_std, back = own_part(parameters, sizes), transposed(parameters, sizes)
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradients = np.zeros((len(weights), len(parameters)), np.float32)
@@ -164,7 +152,7 @@ def policy_gradients(observations, actions, weights, parameters, sizes):
 
 @kernel
 def own_part(vector, sizes):
-    """What a vector like a `Policy`'s parameters has after its network's: of the log_std."""
+    """The part for log_std of a vector like a `Policy`'s parameters: what follows the network's."""
     count = 0
     for layer in range(len(sizes) - 1):
         count += (sizes[layer] + 1) * padded(sizes[layer + 1])
@@ -182,10 +170,10 @@ def taken(array, chosen):
 
 @kernel
 def surrogate_weights(new_log_probs, steps, chosen, clip, scale):
-    """What the gradient of PPO's clipped surrogate weighs each ∇ log π(a|s) with, float32 [N].
+    """The weight of each ∇ log π(a|s) in the gradient of PPO's clipped surrogate, float32 [N].
 
-    The surrogate min(rA, clip(r)A), with ratio r, is flat where the ratio is already past the bound
-    that the advantage pushes it to; elsewhere its gradient is r A ∇ log π, here times `scale`.
+    The surrogate min(rA, clip(r)A) is flat where the ratio r is beyond the bound to which the
+    advantage A pushes it. Elsewhere its gradient is r A ∇ log π, here times `scale`.
     """
     weights = np.empty_like(new_log_probs)
     for n in range(len(weights)):
@@ -198,10 +186,10 @@ def surrogate_weights(new_log_probs, steps, chosen, clip, scale):
 
 @kernel
 def policy_change(new_log_probs, old_log_probs, clip):
-    """How far the policy is from the one that acted, from log π(a|s) of both, float32 [N].
+    """Approximate KL divergence and clip fraction, from log π(a|s) of both policies, float32 [N].
 
-    Returns the mean of r - 1 - log r, which estimates the KL divergence (Schulman 2020), and how
-    many of the ratios r are outside the clipping bounds, as a share.
+    The former is the mean of r - 1 - log r (Schulman 2020), the latter the share of the ratios r
+    outside the clipping bounds.
     """
     divergence, outside = 0.0, 0.0
     for n in range(len(new_log_probs)):

@@ -18,21 +18,16 @@ def custom_module(
     outputs: int,
     generator: np.random.Generator,
 ) -> torch.nn.Module:
-    """The user's own module; what it draws from torch's global generator comes from `generator`.
+    """The user's own module; `generator` seeds torch's global one while it is made.
 
-    Raises `ConfigError` for a module that keeps more state than its parameters, or whose outputs
-    are not [N, outputs] or not the same twice: such a run would not resume to the bit.
+    Raises `ConfigError` if it has buffers, or outputs that are not [N, outputs] or not the same
+    twice: the run would not resume to the bit.
     """
     with torch.random.fork_rng(devices=[]), as_torch_begins():
         torch.manual_seed(int(generator.integers(2**63)))
-        module = make(
-            settings.module,
-            "ppo.network.module",
-            torch.nn.Module,
-            True,
-            *(inputs, outputs, hidden_units),
-            **settings.arguments,
-        ).float()
+        key, given = "ppo.network.module", (inputs, outputs, hidden_units)
+        kind = torch.nn.Module
+        module = make(settings.module, key, kind, True, *given, **settings.arguments).float()
         trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
         shapes = [tuple(module(trial).shape), (2, outputs)]
         same = torch.equal(module(trial), module(trial))
@@ -44,13 +39,13 @@ def custom_module(
         "gives other outputs the second time (dropout?)": not same,
     }.items():
         if found:
-            raise ConfigError(f"ppo.network.module: the module of {settings.module!r} {problem}")
+            raise ConfigError(f"{key}: the module of {settings.module!r} {problem}")
     return module
 
 
 @contextmanager
 def as_torch_begins() -> Iterator[None]:
-    """New tensors are float32 on the CPU, whatever the program or the user's module has set."""
+    """New tensors are float32 on the CPU, whatever defaults the program has set."""
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:

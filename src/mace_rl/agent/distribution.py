@@ -1,7 +1,7 @@
 """Distributions over actions: softmax for Discrete ones, else a diagonal Gaussian; compiled.
 
-Its log standard deviations, `log_std`, float32 [actions], do not depend on the state; for Discrete
-actions there are none.
+The Gaussian's log standard deviations, `log_std`, float32 [actions], do not depend on the state.
+For Discrete actions `log_std` is empty.
 """
 
 import numpy as np
@@ -27,8 +27,7 @@ def log_sum_exp(logits):
 def log_probs(outputs, log_std, actions):
     """log π(a|s), float32 [N].
 
-    outputs: the network's, [N, actions]: logits or means; actions: int64 [N] or float32 [N,
-    actions].
+    outputs: logits or means, [N, actions]; actions: int64 [N] or float32 [N, actions].
     """
     result = np.empty(len(outputs), np.float32)
     if actions.ndim == 1:
@@ -81,10 +80,7 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
 
 @kernel
 def sample_categorical(logits, uniform):
-    """Sample a categorical action by inverting its distribution function at `uniform` in [0, 1).
-
-    Returns (action from 0, log-probability, float32).
-    """
+    """An action from 0 and its log-probability; uniform: in [0, 1), where the CDF is inverted."""
     log_total = log_sum_exp(logits)
     cumulative = 0.0
     action = len(logits) - 1  # stays if rounding leaves the sum below `uniform`
@@ -98,10 +94,7 @@ def sample_categorical(logits, uniform):
 
 @kernel
 def sample_gaussian(means, log_std, normal):
-    """Sample a diagonal Gaussian action, means + exp(log_std) · normal; `normal`: [actions].
-
-    Returns (action float32 [actions], not clipped to the bounds; log-probability, float32).
-    """
+    """An action, means + exp(log_std) · normal, float32 [actions], and its log-probability."""
     action = np.empty(len(log_std), np.float32)
     for i in range(len(log_std)):
         action[i] = means[i] + exp(log_std[i]) * f32(normal[i])

@@ -1,4 +1,4 @@
-"""What PPO's update needs of a learner, of which there are two: compiled, and in plain PyTorch."""
+"""The interface of PPO's update, which is in `torch_learner`, to read, and `compiled_learner`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,12 +30,12 @@ class Minibatches(NamedTuple):
 
 @dataclass
 class Update:
-    """What an update tells of itself."""
+    """Diagnostics of an update."""
 
     gradient_norms: dict[str, float]  # of the last minibatch, before clipping, by network
-    # Means over the steps of the last epoch, each as its minibatch was learnt from.
+    # Means over the steps of the last epoch, before each minibatch's update.
     approximate_kl: float  # of the policy to the one that acted (Schulman 2020)
-    clip_fraction: float  # of the ratios outside the clipping bounds
+    clip_fraction: float  # share of the ratios outside the clipping bounds
     entropy: float  # of the policy, nats
 
 
@@ -48,15 +48,12 @@ class Learner(Protocol):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """A policy of such networks for rollouts."""
+        """The policy for rollouts."""
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
     ) -> Update:
-        """Descend PPO's losses in every minibatch.
-
-        returns: for each critic the λ-returns that it learns, float32 [N].
-        """
+        """Descend PPO's losses in all minibatches; returns: each critic's λ-returns, [N]."""
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
@@ -64,19 +61,12 @@ class Learner(Protocol):
         """∇_θ of the mean of log π(a|s) · A for each of several advantages, [N]; float32 [n]."""
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """`direction` in the policy's parameters, [n], in the units in which its Adam steps.
+        """`Adam.preconditioned` of the policy's optimiser."""
 
-        That is over √v̂ + ε, v̂ the second moment; the direction itself before the first step.
-        """
-
-    def state_dict(self) -> dict[str, Any]:
-        """The optimiser's state; not the parameters."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 def parameters_of(policy: Policy, critics: Mapping[str, Network]) -> dict[str, np.ndarray]:
     """Those of "actor" and of each critic, float32 [n]: the same memory."""
-    own = {kind: critic.parameters for kind, critic in critics.items()}
-    return {"actor": policy.parameters, **own}
+    return {"actor": policy.parameters} | {kind: own.parameters for kind, own in critics.items()}

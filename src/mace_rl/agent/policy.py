@@ -1,4 +1,4 @@
-"""The policy π(a|s), a distribution over actions on the outputs of a network; acting with it."""
+"""The policy π(a|s): a network whose outputs say a distribution over actions; acting with it."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -18,9 +18,8 @@ Action = int | np.ndarray  # from 0, or float32 [actions] before clipping to the
 class Policy:
     """Categorical for Discrete actions, diagonal Gaussian for Box ones.
 
-    The Gaussian's log standard deviation does not depend on the state; its samples are clipped to
-    the action bounds only when acting. `parameters`, float32 [n], are the network's, then the log
-    standard deviations.
+    Samples are clipped to the action bounds only for the environment. `parameters`, float32 [n],
+    are the network's, then the log standard deviations, which do not depend on the state.
     """
 
     def __init__(
@@ -40,7 +39,7 @@ class Policy:
 
 
 class ActingPolicy(Protocol):
-    """What a rollout needs of the policy, with observation normalisation in front of it.
+    """A policy for rollouts, which takes observations before normalisation.
 
     Its weights follow later updates; the normalisation stays as it was when this was made.
     """
@@ -54,7 +53,7 @@ class ActingPolicy(Protocol):
 
 @dataclass(frozen=True)
 class NetworkActing:
-    """Acting with any network."""
+    """An `ActingPolicy` of any network."""
 
     policy: Policy
     normalisation: Normalisation
@@ -66,7 +65,6 @@ class NetworkActing:
         return self.policy.network.outputs(seen[None])
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
         outputs = self.outputs(observation)[0]
         if self.policy.discrete:
             return sample_categorical(outputs, noise)
@@ -74,34 +72,32 @@ class NetworkActing:
 
 
 class CompiledActing(NamedTuple):
-    """Acting with a compiled network: plain arrays, for compiled rollouts too."""
+    """An `ActingPolicy` of a compiled network: plain arrays, for compiled rollouts too."""
 
     normalisation: Normalisation
     parameters: np.ndarray  # float32, see `network_kernels`
     sizes: np.ndarray  # int64 [layers + 1]
     log_std: np.ndarray  # float32 [actions]; empty for Discrete actions
-    seen: np.ndarray  # overwritten, like the next, see `means_or_logits`
+    seen: np.ndarray  # scratch memory of `means_or_logits`, like the next
     activations: np.ndarray
 
     @classmethod
     def of(
         cls, network: CompiledMLP, log_std: np.ndarray, normalisation: Normalisation
     ) -> "CompiledActing":
-        """Acting with this network."""
+        """With this network."""
         sizes = network.sizes
-        seen = np.empty((1, sizes[0]), np.float32)
-        buffer = activation_buffer(1, sizes)
-        return cls(normalisation, network.parameters, sizes, log_std, seen, buffer)
+        scratch = np.empty((1, sizes[0]), np.float32), activation_buffer(1, sizes)
+        return cls(normalisation, network.parameters, sizes, log_std, *scratch)
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`."""
         sample = act_box if len(self.log_std) else act_discrete
         return sample(observation, self, noise)
 
 
 @kernel
 def means_or_logits(observation, policy):
-    """The network's outputs for one observation, not yet normalised; policy: `CompiledActing`."""
+    """The network's outputs for one observation before normalisation; policy: `CompiledActing`."""
     normalise(observation, policy.normalisation, policy.seen[0])
     outputs = forward(policy.seen, policy.parameters, policy.sizes, policy.activations)
     return outputs[0, : policy.sizes[-1]]

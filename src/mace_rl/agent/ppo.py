@@ -23,25 +23,22 @@ OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviati
 
 @dataclass(eq=False)
 class ActorCritic:
-    """What plays: the policy, the critics, and the normalisation of what they see."""
+    """Policy, critics, and the normalisation of their inputs."""
 
     config: PPOConfig
     policy: Policy
     critics: Mapping[str, Network]
     normaliser: RunningNormaliser
-    learner_of: type[Learner]  # what trains such networks
+    learner_of: type[Learner]  # trains such networks
 
     def normalise(self, observations: np.ndarray) -> np.ndarray:
-        """What the networks see of `observations`, float32 [N, observation]."""
+        """`observations` as the networks see them, float32 [N, observation]."""
         if not self.config.normalise_observations:
             return observations
         return self.normaliser(observations, OBSERVATION_CLIP)
 
     def normalisation(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Mean and standard deviation of observations, [observation], and the normalised's bound.
-
-        What leaves observations as they are if they are not to be normalised.
-        """
+        """Mean, standard deviation, [observation] each, and bound; (0, 1, ∞) without one."""
         if self.config.normalise_observations:
             return self.normaliser.mean, self.normaliser.std, OBSERVATION_CLIP
         size = len(self.normaliser.mean)
@@ -55,9 +52,9 @@ class ActorCritic:
 class PPO(ActorCritic, Stateful):
     """An actor and critics with the learner that trains them.
 
-    The total reward R_E + β R_I is a sum, so its advantage is A_E + β A_I with a value function
-    for each part: "extrinsic" always, "intrinsic" with a curiosity bonus. The parts share no
-    weights: the bonus can reach the extrinsic critic in no way, and the actor only through β.
+    The advantage of the total reward R_E + β R_I is A_E + β A_I, with a critic for each part:
+    "extrinsic" always, "intrinsic" with a bonus. The networks share no weights, so the bonus
+    reaches the actor only through β.
     """
 
     STATE = ("learner", "normaliser", "generator", "reward_scales", "advantage_scales")
@@ -65,23 +62,23 @@ class PPO(ActorCritic, Stateful):
     def __init__(self, networks: ActorCritic, generator: np.random.Generator) -> None:
         super().__init__(**vars(networks))
         self.generator = generator
-        self.learner = self.learner_of(self.config, self.policy, self.critics)
-        smallest = {"extrinsic": (1.0, self.config.smallest_advantage)}
-        self.reward_scales: dict[str, RewardScale] = {}
-        self.advantage_scales: dict[str, AdvantageScale] = {}
-        for kind in self.critics:
-            least_reward, least_advantage = smallest.get(kind, (TINY, TINY))
-            self.reward_scales[kind] = RewardScale(self.config.discount, least_reward)
-            self.advantage_scales[kind] = AdvantageScale(least_advantage)
+        config = self.config
+        self.learner = self.learner_of(config, self.policy, self.critics)
+        rewards, advantages = {"extrinsic": 1.0}, {"extrinsic": config.smallest_advantage}
+        self.reward_scales = {
+            kind: RewardScale(config.discount, rewards.get(kind, TINY)) for kind in self.critics
+        }
+        self.advantage_scales = {
+            kind: AdvantageScale(advantages.get(kind, TINY)) for kind in self.critics
+        }
 
     def advantages_and_returns(
         self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
-        observations: normalised, [T + 1, observation]; rewards: [T], as they were paid. A terminal
-        state is worth 0; a state the time limit cut off at is worth what the critic says. With
-        `scale_rewards` all is in units of the reward's scale, this episode included.
+        observations: normalised, [T + 1, observation]; rewards: [T], before scaling. The last state
+        is worth 0 if it is terminal, else what the critic says. The unit is `reward_scale`.
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
@@ -97,15 +94,15 @@ class PPO(ActorCritic, Stateful):
         return advantages, advantages + values[:-1]
 
     def reward_scale(self, kind: str) -> float:
-        """The unit of rewards, advantages and returns of one kind, in what was paid."""
+        """The divisor of one kind of rewards."""
         return self.reward_scales[kind].value if self.config.scale_rewards else 1.0
 
     def advantage_scale(self, kind: str) -> float:
-        """What advantages of one kind are divided by before β weighs them."""
+        """The divisor of one kind of advantages, before β weighs them."""
         return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
 
     def unit(self, kind: str) -> float:
-        """What was paid for an advantage of 1 where β weighs it."""
+        """The unscaled reward that an advantage of 1, where β weighs it, stands for."""
         return self.reward_scale(kind) * self.advantage_scale(kind)
 
     def update(self, batch: Batch, returns: Mapping[str, np.ndarray]) -> Update:
@@ -113,12 +110,10 @@ class PPO(ActorCritic, Stateful):
         return self.learner.update(batch, returns, self.minibatches(len(batch.advantages)))
 
     def minibatches(self, count: int) -> Minibatches:
-        """The minibatches of an update on so many steps; all in order if that is one."""
-        size = self.config.minibatch_size
-        shape = self.config.epochs, count
-        if size is None or count <= size:
-            return Minibatches(shuffled(np.ones(shape)), np.array([count]))
-        # As even as can be: a last one of two samples would step as far as one of 128.
+        """The minibatches of an update on `count` steps: in random order, unless there is one."""
+        shape, size = (self.config.epochs, count), self.config.minibatch_size or count
+        # Of equal size: a last one of two steps would change as much as one of 128.
         parts = math.ceil(count / size)
         ends = np.arange(1, parts + 1) * count // parts
-        return Minibatches(shuffled(self.generator.random(shape)), ends)
+        draws = self.generator.random(shape) if parts > 1 else np.ones(shape)
+        return Minibatches(shuffled(draws), ends)

@@ -11,10 +11,10 @@ from mace_rl.state import Stateful
 
 
 class RewardScale(Stateful):
-    """What rewards are divided by: the standard deviation of their discounted sums so far.
+    """The divisor of rewards: the standard deviation of their discounted sums so far.
 
     The sum at a step is r_t + γ r_{t-1} + γ² r_{t-2} + … within its episode (as in the code of
-    Schulman et al. 2017; Engstrom et al. 2020), and the scale is never below `smallest`.
+    Schulman et al. 2017; Engstrom et al. 2020). The divisor is at least `smallest`.
     """
 
     STATE = ("sums",)
@@ -29,15 +29,12 @@ class RewardScale(Stateful):
 
     @property
     def value(self) -> float:
-        """The scale; at least `smallest`."""
+        """The divisor."""
         return max(float(self.sums.std[0]), self.smallest)  # 1 while the sums have not varied
 
 
 class AdvantageScale(Stateful):
-    """What advantages are divided by: their root mean square so far, at least `smallest`.
-
-    It comes down slowly when advantages do, so that what fades in a task fades here.
-    """
+    """The divisor of advantages: their root mean square so far, at least `smallest`."""
 
     STATE = ("count", "squares")
 
@@ -52,7 +49,7 @@ class AdvantageScale(Stateful):
 
     @property
     def value(self) -> float:
-        """The scale; at least `smallest`."""
+        """The divisor."""
         return max(math.sqrt(self.squares / max(self.count, 1)), self.smallest)
 
 

@@ -18,7 +18,7 @@ from mace_rl.state import Stateful
 
 
 class TorchLearner(Stateful):
-    """See `Learner`. It trains any torch module, and `CompiledLearner` computes what it does."""
+    """A `Learner` for any torch modules; `CompiledLearner` computes the same."""
 
     STATE = ("parameters", "optimiser")
 
@@ -36,7 +36,7 @@ class TorchLearner(Stateful):
         self.optimiser = torch.optim.Adam(groups, eps=EPSILON)
 
     def losses(self, batch: Batch, returns: dict[str, np.ndarray]) -> tuple[Tensor, Tensor]:
-        """The loss of a minibatch, and [3]: approximate KL, clip fraction and entropy of it."""
+        """The loss of a minibatch, and its approximate KL, clip fraction and entropy, [3]."""
         observations, actions, log_probs, advantages = map(from_numpy, batch)
         policy, epsilon = self.actor(observations), self.config.clip
         log_ratio = policy.log_prob(actions) - log_probs
@@ -53,7 +53,7 @@ class TorchLearner(Stateful):
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
     ) -> Update:
-        """See `Learner`. One loss will do: the networks share no weights."""
+        """As `Learner` says. The losses are summed: the networks share no weights."""
         for order in minibatches.epochs:
             told = np.zeros(3)
             for chosen in np.split(order, minibatches.ends[:-1]):
@@ -69,9 +69,7 @@ class TorchLearner(Stateful):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        """See `Learner`."""
         return NetworkActing(policy, normalisation)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        """See `Learner`."""
         return self.actor.preconditioned(direction, self.optimiser)

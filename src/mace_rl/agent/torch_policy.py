@@ -10,10 +10,10 @@ from mace_rl.numerics.adam import DECAY_SQUARE, EPSILON
 
 
 class TorchPolicy(torch.nn.Module):
-    """π(·|s) for observations as the network sees them, [..., observation].
+    """π(·|s) for normalised observations, [..., observation].
 
     Discrete actions count from 0; the others are not clipped to their bounds. Its parameters are a
-    `Policy`'s: the same memory, but for those of a compiled network.
+    `Policy`'s, in the same memory unless its network is compiled.
     """
 
     def __init__(self, policy: Policy, validate: bool | None = None) -> None:
@@ -35,7 +35,6 @@ class TorchPolicy(torch.nn.Module):
     def gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
-        """See `Learner.policy_gradients`."""
         log_probs = self(from_numpy(observations)).log_prob(from_numpy(actions))
         found = []
         for item in advantages:
@@ -51,7 +50,7 @@ class TorchPolicy(torch.nn.Module):
         return [*self.network.parameters(), *([] if self.discrete else [self.log_std])]
 
     def preconditioned(self, direction: np.ndarray, adam: torch.optim.Adam) -> np.ndarray:
-        """See `Learner.preconditioned`. A weight that has had no gradient has 0 in `direction`."""
+        """As `Learner` says. `direction` is 0 for weights that have had no gradient."""
         states = [adam.state.get(part) or None for part in self.weights()]
         if not any(states):
             return direction

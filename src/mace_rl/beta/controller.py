@@ -9,10 +9,10 @@ from mace_rl.environments.rollout import Episode
 
 
 class Effect(NamedTuple):
-    """What the β of one episode changes in the update on it."""
+    """What a little more β in each episode of a rollout changes in the update on it."""
 
     direction: np.ndarray  # dθ'/dβ as the optimiser steps, up to a factor, float32 [n]
-    advantage_rms: float  # of what β weighs: the episode's intrinsic advantages, in their scale
+    advantage_rms: float  # of what β weighs: the rollout's intrinsic advantages, in their scale
 
 
 class BetaController(ABC):
@@ -28,7 +28,7 @@ class BetaController(ABC):
     @property
     @abstractmethod
     def beta(self) -> float:
-        """β of the next episode, in [0, 1]."""
+        """β of the next episode, in [0, 10]; the paper has at most 1."""
 
     @abstractmethod
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
@@ -38,12 +38,12 @@ class BetaController(ABC):
         """After the last `next_episode` before an update of the policy, and before `learn`."""
         return  # most rules do not ask when the policy changes
 
-    def learn(self, gradient: np.ndarray, strength: float, effects: list[Effect]) -> float | None:
-        """After each rollout, before the policy's update on it: what the βs do to the policy.
+    def learn(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+        """After each rollout, before the policy's update on it: what its β does to the policy.
 
         gradient: g_E, the policy gradient of the rollout's extrinsic return, [n]; strength: RMS of
-        the extrinsic advantages in their scale; effects: of each of its episodes, in order. Returns
-        the mean credit of the βs that were judged now, or None.
+        the extrinsic advantages in their scale. Returns the credit of the earlier β that has been
+        judged with this, or None.
         """
         raise NotImplementedError("this rule for β does not learn")
 

@@ -11,38 +11,37 @@ from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.bonus.novelty import novelty
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.finite import numbers
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.state import Stateful
 from mace_rl.streams import Streams
 
-SMALLEST_SPAN = 0.1  # of reward: returns that differ by less differ by the critic's errors
+SMALLEST_SPREAD = 0.01  # of reward: where returns differ by less, nothing is unproductive
 
 
 @kernel
 def relevance(
-    similarity: np.ndarray, recalled: np.ndarray, worst: float, best: float
+    similarity: np.ndarray, recalled: np.ndarray, usual: float, spread: float
 ) -> np.ndarray:
-    """Memory relevance in [0, 1], float64 [N]: 1 - similarity · (1 - productivity).
+    """Memory relevance in [0, 1], float64 [N]: 1 - similarity · unproductivity.
 
-    similarity, recalled: float32 [N], the latter the remembered return-to-go. Productivity is how
-    far the recalled return lies on the way from the `worst` to the `best` return that memory holds,
-    in [0, 1]; 0 where none is better than another. So a state unlike anything remembered has
-    relevance 1, one like unproductive states goes toward 0, and one like productive states stays
-    near 1.
+    similarity, recalled: float32 [N], the latter the remembered return-to-go. A state is
+    unproductive as far as less came of it than is `usual`, in units of the `spread` of what memory
+    holds, at most 1; where hardly any returns differ, none is. A single lucky return does not make
+    all others unproductive: it moves what is usual only by as much as it is rare.
     """
-    span = best - worst
     result = np.empty(len(similarity))
     for n in range(len(similarity)):
-        productivity = np.float32(0)
-        if span > SMALLEST_SPAN:
-            productivity = (recalled[n] - np.float32(worst)) / np.float32(span)
-            if productivity < 0:  # so written, NaN stays NaN
-                productivity = np.float32(0)
-            elif productivity > 1:
-                productivity = np.float32(1)
-        result[n] = 1 - np.float64(similarity[n]) * np.float64(np.float32(1) - productivity)
+        unproductivity = np.float32(0)
+        if spread > SMALLEST_SPREAD:
+            unproductivity = (np.float32(usual) - recalled[n]) / np.float32(spread)
+            if unproductivity < 0:  # so written, NaN stays NaN
+                unproductivity = np.float32(0)
+            elif unproductivity > 1:
+                unproductivity = np.float32(1)
+        result[n] = 1 - np.float64(similarity[n]) * np.float64(unproductivity)
     return result
 
 
@@ -88,7 +87,7 @@ class Curiosity(Stateful, IntrinsicReward):
         if self.memory.neighbours is None:
             return Bonus(new, new, np.ones(len(new)), np.zeros(len(new)))
         recalled, similarity = self.memory.recall(states)
-        relevant = relevance(similarity, recalled, self.worst, self.best)
+        relevant = relevance(similarity, recalled, self.usual, self.spread)
         return Bonus(new * relevant, new, relevant, similarity)
 
     def scale(self) -> np.ndarray:
@@ -103,7 +102,7 @@ class Curiosity(Stateful, IntrinsicReward):
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
         """Make the episode part of memory and of what is no longer novel.
 
-        returns: extrinsic return-to-go of each step, [T], as its λ-return.
+        returns: extrinsic return-to-go of each step, [T], as it was paid.
         """
         if self.memory is not None:
             self._memorise(self.memory, episode, returns)
@@ -116,8 +115,8 @@ class Curiosity(Stateful, IntrinsicReward):
         # What the memory compares states with until the next episode is remembered.
         if self.memory is not None and len(self.memory) > 0:
             self.memory.build_index(self.normaliser.mean, self.scale())
-            returns = self.memory.values[: len(self.memory), -1]
-            self.worst, self.best = float(returns.min()), float(returns.max())
+            returns = self.memory.values[: len(self.memory), -1].astype(np.float64)
+            self.usual, self.spread = mean(returns), math.sqrt(variance(returns))
 
     def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.

@@ -1,8 +1,4 @@
-"""Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs.
-
-`MaskedAutoencoder` defines the network in torch, `CompiledAutoencoder` computes the same in
-compiled code; `DensityEstimator` makes a density of its outputs.
-"""
+"""Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs."""
 
 import numpy as np
 import torch
@@ -16,10 +12,9 @@ SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have i
 
 
 class MaskedAutoencoder(torch.nn.Module):
-    """μ_i and log σ_i, each a function of the inputs before the i-th: [N, size] → [N, 2 size].
+    """μ_i and log σ_i, functions of the inputs before the i-th: [N, size] → [N, 2 size].
 
-    One hidden layer with tanh. Masked weights start at 0 and their gradient is 0, so they stay
-    there.
+    One hidden layer with tanh. Masked weights start at 0, and their gradient is 0.
     """
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
@@ -53,15 +48,11 @@ class CompiledAutoencoder(CompiledMLP):
             weights[:] = mask.numpy().T
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        """See `CompiledMLP`."""
         return super().backward(trace, grad_outputs) * self.mask
 
 
 class DensityEstimator:
-    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)).
-
-    Being autoregressive it is normalised: p integrates to 1 whatever the weights are.
-    """
+    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)): p integrates to 1 whatever the weights."""
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
         self.network = CompiledAutoencoder(MaskedAutoencoder(size, hidden_units, generator))

@@ -1,12 +1,13 @@
 """The interface of rewards for exploring: the paper's curiosity, or one of the user's own."""
 
 import math
-from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from abc import abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 
 from mace_rl.environments.rollout import Episode
+from mace_rl.state import HasState
 
 
 class Bonus(NamedTuple):
@@ -18,15 +19,15 @@ class Bonus(NamedTuple):
     similarity: np.ndarray | None = None  # to what memory holds, in [0, 1]
 
 
-class IntrinsicReward(ABC):
-    """R_I of every step, and what it rests on.
+class IntrinsicReward(HasState):
+    """R_I of every step.
 
-    An episode is rewarded for what was known before it; `remember` adds it to what is known. One of
-    the user's own is made as Class(spaces, generator, **arguments) with the environment's
+    An episode is rewarded for what was known before it; `remember` adds it to what is known. A
+    user's own is made as Class(spaces, generator, **arguments) with the environment's
     `mace_rl.environments.spaces.Spaces`; it raises `ConfigError` for arguments that it cannot use.
     """
 
-    largest = math.inf  # a step's reward is in [0, largest]; a run in which it is not is stopped
+    largest = math.inf  # bound of a step's reward: a run is stopped if one is not in [0, largest]
 
     @abstractmethod
     def bonus(self, episode: Episode) -> Bonus:
@@ -35,11 +36,3 @@ class IntrinsicReward(ABC):
     @abstractmethod
     def remember(self, episode: Episode, returns: np.ndarray) -> None:
         """Make the episode part of what is known; returns: extrinsic return-to-go, [T]."""
-
-    @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""

@@ -13,11 +13,8 @@ from mace_rl.state import Stateful
 class EpisodicMemory(Stateful):
     """A fixed number of (key, value) entries; the least recently used one is overwritten.
 
-    Keys are states as observed. They are compared in an embedding that the caller gives, here the
-    running standardisation, so that stored keys follow it as it changes: `build_index` prepares
-    that once, for all that is asked until the next `write`.
-
-    A value is (next state, reward, return-to-go): what came of being in the state.
+    Keys are states as observed, compared after the standardisation that `build_index` was given. A
+    value is (next state, reward, return-to-go): what followed the state.
     """
 
     STATE = ("keys", "values", "usage", "number", "read", "time", "written", "stored")
@@ -26,13 +23,12 @@ class EpisodicMemory(Stateful):
         self.config = config
         self.keys = np.zeros((config.capacity, key_size), np.float32)
         self.values = np.zeros((config.capacity, key_size + 2), np.float32)
-        # For each entry the time of its last reading or writing, and its number among all that were
-        # ever written, from 1; below 0 for an empty one, so that no two are equal.
-        self.usage = np.zeros(config.capacity, np.int64)
+        self.usage = np.zeros(config.capacity, np.int64)  # time of the last reading or writing
+        # Their number among all that were ever written, from 1; below 0 for empty ones.
         self.number = np.arange(-config.capacity, 0)
         self.time = self.written = self.stored = 0
-        self.newest_first = np.empty(0, np.int64)  # the entries, from the last written on
-        self.read = np.zeros(config.capacity, np.bool_)  # entries, since the last `write`
+        self.newest_first = np.empty(0, np.int64)  # entries, from the last written on
+        self.read = np.zeros(config.capacity, np.bool_)  # entries read since the last `write`
         self.neighbours: Neighbours | None = None
 
     def __len__(self) -> int:
@@ -44,14 +40,12 @@ class EpisodicMemory(Stateful):
         """Store N experiences over the least recently used entries.
 
         keys, next_states: [N, key]; rewards, returns: [N]. Of more than `capacity` the last ones
-        are stored. What was read since the last time counts as used first, all at the same time.
+        are stored. All that was read since the last `write` was used at the same time, before it.
         """
-        if len(self):
-            use(self.read, self.time + 1, self.usage)
+        self.usage[self.read], self.read[:] = self.time + 1, False
         self.time += 2
         kept = min(len(keys), self.config.capacity)
-        # A lookup of a long episode reads nearly every entry: of equally used ones the earliest
-        # written goes, or entries that are read for ever would never be outdated.
+        # Of equally used ones the first written goes: a long episode reads nearly every entry.
         age = self.usage * 2**32 + self.number
         oldest = np.argpartition(age, kept - 1)[:kept]
         oldest = oldest[np.argsort(age[oldest])]
@@ -69,17 +63,15 @@ class EpisodicMemory(Stateful):
 
     def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
         """From now on distances are Euclidean between (x - mean) / std; both are [key]."""
-        # Of equally near entries the first is read: the last written, so that what came of a state
-        # lately is what is remembered of it.
+        # `Neighbours` gives the first of equally near entries: here the last written.
         newest = np.take(self.keys, self.newest_first, axis=0)
         self.neighbours = Neighbours(newest, mean, std)
 
     def search(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The k nearest entries to each state, float32 [N, key], which have been read now.
+        """The k nearest entries to each state, float32 [N, key]; marks them as read.
 
-        Returns squared distances per dimension, so that the kernel does not depend on how many
-        there are, float32 [N, k] ascending, and the entries, int64 [N, k]. Raises `LookupError` if
-        nothing is stored, or there is no index of it.
+        Returns squared distances, float32 [N, k] ascending, divided by the number of dimensions,
+        and the entries, int64 [N, k]. Raises `LookupError` if nothing is stored or indexed.
         """
         if not self.neighbours:
             raise LookupError("the episodic memory is empty, or not indexed since it was written")
@@ -90,36 +82,25 @@ class EpisodicMemory(Stateful):
         return squared_distances / np.float32(states.shape[1]), entries
 
     def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Kernel-weighted mean of the k nearest entries' returns, and how similar the nearest is.
+        """Kernel-weighted mean of the k nearest entries' returns, and similarity of the nearest.
 
         states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5). Returns
-        float32 [N], and [N] in (0, 1]: the kernel at the nearest key over the kernel at 0.
+        float32 [N] each; similarity, in (0, 1], is the kernel at the nearest key over that at 0.
         """
         return recollect(*self.search(states), self.values[:, -1], self.config.kernel_bandwidth)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`; `build_index` before the next look-up."""
+        """As `Stateful` says; `build_index` before the next look-up."""
         super().load_state_dict(state)
         self.newest_first = np.argsort(-self.number[: len(self)])
         self.neighbours = None
 
 
 @kernel
-def use(read: np.ndarray, time: int, usage: np.ndarray) -> None:
-    """Count the entries that were read as used at `time`, and as not read since."""
-    for entry in range(len(read)):
-        if read[entry]:
-            usage[entry], read[entry] = time, False
-
-
-@kernel
 def recollect(
     squared_distances: np.ndarray, indices: np.ndarray, returns: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `EpisodicMemory.recall` computes from the nearest entries.
-
-    squared_distances: float32 [N, k], ascending; indices: int64 [N, k]; returns: float32 [M].
-    """
+    """`EpisodicMemory.recall` from what `search` returns, and all entries' returns, float32 [M]."""
     recalled, similarity = np.empty((2, len(squared_distances)), np.float32)
     for n in range(len(squared_distances)):
         total = weighted = 0.0

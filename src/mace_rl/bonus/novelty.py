@@ -1,7 +1,7 @@
 """Novelty of states, in [0, 1]: visitation counts, or k-NN distances and a density estimator."""
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -18,17 +18,17 @@ from mace_rl.numerics.elementary import exp, fma
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.normaliser import RunningNormaliser, standardised
-from mace_rl.state import Stateful
+from mace_rl.state import HasState, Stateful
 from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
 
 
-class Novelty(ABC):
+class Novelty(HasState):
     """How new the states of an episode are; `observe` then makes them known.
 
-    One of the user's own is made as Class(size, generator, **arguments), with the size of an
-    observation (a Discrete one is one-hot).
+    A user's own is made as Class(size, generator, **arguments), with the size of an observation (a
+    Discrete one is one-hot).
     """
 
     @abstractmethod
@@ -36,9 +36,9 @@ class Novelty(ABC):
         """Novelty of each state, [T, observation] → float64 [T] in [0, 1]."""
 
     def continued(self, states: np.ndarray, visits: np.ndarray) -> np.ndarray:
-        """The same when the episode came to others before.
+        """The same for states in the middle of an episode.
 
-        visits: how often to each of the Discrete ones, [observation]; of Box ones 0.
+        visits: of the episode so far to each Discrete state, [observation]; 0 for Box ones.
         """
         return self(states)
 
@@ -46,24 +46,12 @@ class Novelty(ABC):
     def observe(self, states: np.ndarray) -> None:
         """Take in an episode's states, [T, observation]."""
 
-    @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-
 
 def novelty(
-    config: NoveltyConfig,
-    space: Box | Discrete,
-    normaliser: RunningNormaliser,
-    streams: Streams,
+    config: NoveltyConfig, space: Box | Discrete, normaliser: RunningNormaliser, streams: Streams
 ) -> Novelty:
     """The novelty that the settings ask for, of observations in `space`."""
-    size = len(normaliser.mean)
-    kind = config.kind
+    size, kind = len(normaliser.mean), config.kind
     if kind == "auto":
         kind = "counts" if isinstance(space, Discrete) else "density"
     match kind:
@@ -83,8 +71,8 @@ def novelty(
 class CountNovelty(Stateful, Novelty):
     """1 / n(s) with counts that decay (paper, supplement): for Discrete observations.
 
-    n(s) counts this visit too, those earlier in the episode included, so a first visit has
-    novelty 1. After each episode all counts are multiplied by `count_decay`.
+    n(s) includes this visit and those earlier in the episode, so a first visit has novelty 1. After
+    each episode all counts are multiplied by `count_decay`.
     """
 
     STATE = ("counts",)
@@ -94,11 +82,9 @@ class CountNovelty(Stateful, Novelty):
         self.counts = np.zeros(observation_size)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """See `Novelty`; states are one-hot."""
         return self.continued(states, np.zeros_like(self.counts))
 
     def continued(self, states: np.ndarray, visits: np.ndarray) -> np.ndarray:
-        """See `Novelty`."""
         counts = self.counts + visits
         novelty = np.empty(len(states))
         for t, state in enumerate(states.argmax(axis=1)):
@@ -107,25 +93,22 @@ class CountNovelty(Stateful, Novelty):
         return novelty
 
     def observe(self, states: np.ndarray) -> None:
-        """See `Novelty`; states are one-hot."""
         self.counts = (self.counts + states.sum(axis=0)) * self.config.count_decay
 
 
 class DensityNovelty(Stateful, Novelty):
     """An ensemble of k-NN distances combined with a neural density estimator (paper, supplement).
 
-    Both refer to a buffer that covers the visited states, as `normaliser` sees them, whose owner
-    keeps it up to date. Both are measured against what is usual there: a sample of visited states
-    says how far a known state is from its neighbours, and how likely. A state no farther and no
-    less likely than `KNOWN` of them has novelty 0.
+    Both refer to a buffer that covers the visited states, normalised by `normaliser`, which the
+    caller updates. Both have a threshold from a sample of visited states: `KNOWN` of these are no
+    farther from their neighbours and no less likely. Up to the threshold novelty is 0.
 
-    - k-NN: 1 - d*/d, with d the mean distance to the k nearest visited states and d* what is usual;
+    - k-NN: 1 - d*/d, with d the mean distance to the k nearest visited states and d* the threshold;
       the mean over the ensemble's ks.
-    - Density: 1 - exp(-(l* - l) / D), with l the log-density, l* what is usual, in nats per
-      dimension, of D that vary.
+    - Density: 1 - exp(-(l* - l) / D), with l the log-density, l* the threshold, and D the number of
+      dimensions that vary.
 
-    All of this is brought up to date, `refresh`, at the first end of an episode at which
-    `refresh_every` steps have been taken since it was last; in between nothing changes.
+    `refresh` updates all of this at an episode's end, after at least `refresh_every` steps.
     """
 
     STATE = (
@@ -134,41 +117,38 @@ class DensityNovelty(Stateful, Novelty):
     )
 
     def __init__(
-        self,
-        config: NoveltyConfig,
-        normaliser: RunningNormaliser,
-        streams: Streams,
+        self, config: NoveltyConfig, normaliser: RunningNormaliser, streams: Streams
     ) -> None:
         size = len(normaliser.mean)
-        self.config = config
-        self.normaliser = normaliser
+        self.config, self.normaliser = config, normaliser
         self.buffer = np.zeros((config.buffer_size, size), np.float32)
-        self.seen = 0  # states written until the buffer was full
+        self.seen = 0  # states in the buffer
         self.steps = 0  # states ever observed, of which one in `write_every` is written
-        self.refreshed = 0  # at which of these steps
-        self.waiting = np.empty((0, size), np.float32)  # states to be written since then
+        self.refreshed = 0  # value of `steps` at the last refresh
+        self.waiting = np.empty((0, size), np.float32)  # states to write at the next one
         self.density = DensityEstimator(size, config.density_hidden_units, streams["density"])
         self.optimiser = Adam(self.density.network.parameters, config.density_learning_rate)
         self.batches = streams["density_batches"]
-        self.usual_distances = np.zeros(len(config.neighbours))
-        self.usual_log_density = 0.0
+        self.usual_distances = np.zeros(len(config.neighbours))  # d*
+        self.usual_log_density = 0.0  # l*
         self.ensemble = np.array(sorted(config.neighbours))
         self.largest = max(config.neighbours)
-        self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
+        self._build_index(normaliser)
 
     @property
     def visited(self) -> np.ndarray:
         """The states in the buffer, [n, observation]."""
         return self.buffer[: self.seen]
 
-    def _build_index(self, mean: np.ndarray, std: np.ndarray, varied: np.ndarray) -> None:
-        """Prepare what states are compared with until the next refresh."""
-        self.mean, self.std, self.varied = mean.copy(), std.copy(), varied.copy()
-        self.dimensions = max(1, int(varied.sum()))  # of the observation, that vary
-        self.neighbours = Neighbours(self.visited, mean, std)
+    def _build_index(self, normaliser: Any) -> None:
+        # Until the next refresh; normaliser: has `mean`, `std` and `varied`.
+        self.mean, self.std = normaliser.mean.copy(), normaliser.std.copy()
+        self.varied = normaliser.varied.copy()
+        self.dimensions = max(1, int(self.varied.sum()))  # D
+        self.neighbours = Neighbours(self.visited, self.mean, self.std)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """See `Novelty`. 1 everywhere until the buffer has more states than the largest k."""
+        """As `Novelty` says; 1 until the buffer has more states than the largest k."""
         if self.seen <= self.largest:
             return np.ones(len(states))
         weight = self.config.knn_weight
@@ -193,26 +173,24 @@ class DensityNovelty(Stateful, Novelty):
             self.refresh()
 
     def refresh(self) -> None:
-        """Write what waits, train the density estimator, and see what is usual now.
+        """Write what waits, train the density estimator, and measure the thresholds.
 
-        What waits is new or not by what was usual until now: what is usual depends on the buffer
-        with it.
+        Whether a waiting state is new is judged by the old thresholds: the new ones depend on it.
         """
         free = self.waiting[: len(self.buffer) - self.seen]
         self.buffer[self.seen : self.seen + len(free)] = free
         self.seen += len(free)
-        normaliser = self.normaliser
-        self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
+        self._build_index(self.normaliser)
         if len(self.waiting) > len(free) and self._replace_redundant(self.waiting[len(free) :]):
-            self._build_index(normaliser.mean, normaliser.std, normaliser.varied)
+            self._build_index(self.normaliser)
         self.waiting, self.refreshed = self.waiting[:0], self.steps
         if self.seen <= self.largest:
             return
         shape = self.config.density_steps, self.config.density_batch_size
         samples = self.visited[self.batches.integers(self.seen, size=shape)]
         for sample in samples:
-            self.optimiser.step(-self.density.gradient(normaliser(sample)))
-        log_probs = self.density.log_prob(normaliser(samples[-1]))
+            self.optimiser.step(-self.density.gradient(self.normaliser(sample)))
+        log_probs = self.density.log_prob(self.normaliser(samples[-1]))
         require_finite("a log-density", log_probs)
         self.usual_log_density = quantile(log_probs.astype(np.float64), 1 - KNOWN)
         known = samples[-1][: self.config.calibration_states]
@@ -222,35 +200,30 @@ class DensityNovelty(Stateful, Novelty):
         self.usual_distances = np.array([quantile(column, KNOWN) for column in distances])
 
     def _replace_redundant(self, states: np.ndarray) -> bool:
-        """Let states that are far from the buffer take the places of entries close to others.
+        """Let states far from the buffer replace entries close to others; whether any was replaced.
 
-        Far and close by the k-th neighbour, with the largest k: a place is known that has so many
-        states in the buffer, also where they are equal. States without novelty are close already.
-        Returns whether anything was replaced.
+        Distances are those to the k-th neighbour, with the largest k: so many states in the buffer
+        make a place known, also where they are equal. States without novelty are skipped.
         """
         states = states[self.knn_novelty(states) > 0]
         if len(states) == 0:
             return False
         k, buffer = self.largest, self.neighbours
-        sample = self.batches.integers(len(self.buffer), size=self.config.calibration_states)
-        sample = np.unique(sample)
+        size = self.config.calibration_states
+        sample = np.unique(self.batches.integers(len(self.buffer), size=size))
         apart = buffer.nearest(states, k)[0][:, -1]
         squared, neighbours = buffer.nearest(self.buffer[sample], k + 1)
-        redundant_first = np.argsort(squared[:, -1], kind="stable")
-        new = replacements(
-            states, apart, squared[:, -1], neighbours, sample, redundant_first, buffer.std
-        )
+        new = replacements(states, apart, squared[:, -1], neighbours, sample, buffer.std)
         self.buffer[sample[new >= 0]] = states[new[new >= 0]]
         return bool((new >= 0).any())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
         super().load_state_dict(state)
-        self._build_index(self.mean, self.std, self.varied)
+        self._build_index(self)
 
 
 @kernel
-def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def mean_distances(squared_distances, neighbours):
     """Mean distance to the k nearest, for each k of `neighbours`, float64 [T, ensemble].
 
     squared_distances: float32 [T, at least the largest k], nearest first; neighbours: ascending.
@@ -267,18 +240,13 @@ def mean_distances(squared_distances: np.ndarray, neighbours: np.ndarray) -> np.
 
 
 @kernel
-def shares_beyond(
-    squared_distances: np.ndarray, neighbours: np.ndarray, usual: np.ndarray
-) -> np.ndarray:
+def shares_beyond(squared_distances, neighbours, usual):
     """The mean over the ensemble of 1 - d*/d where d is beyond the `usual` d*, else 0: [T].
 
-    d: of `mean_distances`. Where states repeat exactly both are 0, and what is known is still not
-    new.
+    d: of `mean_distances`. Where states repeat exactly, d, d* and the result are 0.
     """
-    distances, result = (
-        mean_distances(squared_distances, neighbours),
-        np.zeros(len(squared_distances)),
-    )
+    distances = mean_distances(squared_distances, neighbours)
+    result = np.zeros(len(squared_distances))
     for t in range(len(distances)):
         for i in range(len(usual)):
             if not distances[t, i] <= usual[i]:  # so written, NaN stays NaN
@@ -288,7 +256,7 @@ def shares_beyond(
 
 
 @kernel
-def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.ndarray:
+def improbability(log_probs, usual, dimensions):
     """1 - exp(-(l* - l) / D) where l is below the `usual` l*, else 0: float64 [T]."""
     result = np.zeros(len(log_probs))
     for t in range(len(log_probs)):
@@ -299,33 +267,26 @@ def improbability(log_probs: np.ndarray, usual: float, dimensions: int) -> np.nd
 
 
 @kernel
-def replacements(
-    states: np.ndarray,
-    apart: np.ndarray,
-    redundancy: np.ndarray,
-    neighbours: np.ndarray,
-    sample: np.ndarray,
-    redundant_first: np.ndarray,
-    std: np.ndarray,
-) -> np.ndarray:
+def replacements(states, apart, redundancy, neighbours, sample, std):
     """Which of the new states takes the place of each of the sampled entries, -1 for none, [S].
 
-    apart: squared distance of each new state, [N], to its k-th neighbour in the buffer, redundancy:
-    of each sampled entry, [S], whose neighbours' places are in `neighbours`, [S, k + 1]. One after
-    the other, the farthest first: a state is not put in beside its like, and an entry of whose
-    neighbours one has just gone is not redundant any more.
+    apart, redundancy: squared distance of each new state, [N], and of each sampled entry, [S], to
+    its k-th neighbour in the buffer; neighbours: places of the entries' neighbours, [S, k + 1].
+
+    The farthest state replaces the closest entry, and so on. States close to one that was put in
+    are skipped, as are entries of whose neighbours one was replaced.
     """
     apart = apart.copy()
     chosen = np.full(len(sample), -1)
-    for old in redundant_first:
+    for old in np.argsort(redundancy, kind="mergesort"):  # a stable sort
         new = int(np.argmax(apart))
         if not apart[new] > redundancy[old]:
             break
-        kept = True
+        gone = False
         for other in range(len(sample)):
             if chosen[other] >= 0:
-                kept &= not np.any(neighbours[old] == sample[other])
-        if not kept:
+                gone |= bool(np.any(neighbours[old] == sample[other]))
+        if gone:
             continue
         chosen[old] = new
         for n in range(len(states)):

@@ -14,7 +14,7 @@ class CompiledNetwork(Section):
 
 
 class TorchModule(Section):
-    """Any torch module: what `module` returns for (inputs, outputs, hidden_units, **arguments)."""
+    """Any torch module, made as module(inputs, outputs, hidden_units, **arguments)."""
 
     kind: Literal["torch"]
     module: Reference
@@ -34,8 +34,8 @@ class PPOConfig(Section):
     clip: PositiveFloat = Field(lt=1)  # ε
     gae_lambda: float = Field(ge=0, le=1)  # λ; 1 is the Monte Carlo return minus the baseline
     entropy_coefficient: NonNegativeFloat
-    # An update follows the first episode end at which this many steps have been collected, so 1
-    # is one update per episode. Rollouts are whole episodes: β belongs to an episode.
+    # An update follows the first episode end after this many steps, so 1 is one update per episode:
+    # rollouts are whole episodes, since β belongs to an episode.
     rollout_steps: Count
     minibatch_size: Count | None  # None: the whole rollout is one batch
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
@@ -44,10 +44,10 @@ class PPOConfig(Section):
     max_gradient_norm: PositiveFloat
     normalise_observations: bool
     # Rewards are divided by the running standard deviation of their discounted sums; extrinsic ones
-    # by at least 1, lest tiny costs be blown up.
+    # by at least 1, which does not amplify tiny costs.
     scale_rewards: bool
-    # Extrinsic and intrinsic advantages are each divided by their running root mean square before β
-    # weighs them, extrinsic ones by at least `smallest_advantage`: β is then a relative strength.
+    # Extrinsic and intrinsic advantages are each divided by their running root mean square, the
+    # extrinsic by at least `smallest_advantage`, so that β is a relative strength.
     scale_advantages: bool
     smallest_advantage: PositiveFloat
     centre_advantages: bool  # subtract the rollout's mean from total advantages
@@ -55,7 +55,7 @@ class PPOConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _critics_are_networks(cls, values: Any) -> Any:
-        # Records of earlier runs say so; there is nothing else to say any more.
+        # Records of earlier runs have this key, whose one value is left.
         if isinstance(values, dict) and values.get("critic") == {"kind": "network"}:
             return {key: value for key, value in values.items() if key != "critic"}
         return values

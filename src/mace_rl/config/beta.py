@@ -1,23 +1,21 @@
-"""Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
+"""Settings of `mace_rl.beta`: what sets β, from nothing to meta-adaptation."""
 
 from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from mace_rl.config.section import Arguments, Count, Reference, Section, Units
+from mace_rl.config.section import Arguments, Count, Reference, Section
+from mace_rl.records import LARGEST_BETA
 
 
 class MetaConfig(Section):
-    """Meta-adaptation network: the LSTM that sets β (paper, supplement)."""
+    """Meta-adaptation: a pretrained LSTM (paper, supplement), and the credit of earlier βs."""
 
-    hidden_units: Units
-    learning_rate: NonNegativeFloat = Field(lt=1)  # 0: the LSTM stays as it was initialised
-    max_gradient_norm: PositiveFloat
-    horizon: Count  # updates after an episode that judge its β
-    learn_every: Count  # βs that have been judged for one step of the optimiser
-    prior: NonNegativeFloat  # pull of β's logit back to the initial β's, per unit of distance
+    pretrained: bool  # false: no LSTM, in whose place stands the initial β
+    credit_gain: NonNegativeFloat  # of β's logit per unit of z beyond the threshold; 0: no credit
+    credit_threshold: NonNegativeFloat  # of |z|, the sum of the credits in units of its noise
+    horizon: Count  # updates after a rollout that judge its β
     max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
-    max_sequence: Count | None  # longer episodes are condensed to this many elements
 
 
 class NoBonus(Section):
@@ -30,7 +28,7 @@ class ConstantBeta(Section):
     """The same β in every episode."""
 
     kind: Literal["constant"]
-    value: float = Field(ge=0, le=1)
+    value: float = Field(ge=0, le=LARGEST_BETA)
 
 
 class ExponentialBeta(Section):
@@ -51,7 +49,7 @@ class ExponentialBeta(Section):
 
 
 class MetaBeta(Section):
-    """β from the meta-adaptation network; `initial` is β of the first episode."""
+    """β by meta-adaptation; `initial` is β of the first hundredth of the training."""
 
     kind: Literal["meta"]
     initial: float = Field(gt=0, lt=1)

@@ -27,17 +27,17 @@ class MemoryConfig(Section):
 class NoveltyConfig(Section):
     """Novelty: visitation counts (Discrete observations) or k-NN and density (Box)."""
 
-    # auto: by the observation space; custom: the class `estimator` gets (size, generator,
-    # **arguments), with what mace_rl.bonus.novelty.Novelty asks for.
+    # auto: by the observation space; custom: a `mace_rl.bonus.novelty.Novelty`, made as
+    # estimator(size, generator, **arguments).
     kind: Literal["auto", "counts", "density", "custom"] = "auto"
     estimator: Reference | None = None
     arguments: Arguments = Field(default={})
     count_decay: PositiveFloat = Field(le=1)  # factor on all counts after each episode
-    buffer_size: Count  # visited states that k-NN and density refer to, a cover of ...
-    write_every: Count  # ... one in so many
+    buffer_size: Count  # visited states that k-NN and density refer to
+    write_every: Count  # one visited state in so many may be written
     neighbours: list[Count] = Field(min_length=1)  # one k-NN estimator for each k
-    refresh_every: Count  # steps after which what is new is judged anew, at an episode's end
-    calibration_states: Count  # a sample of them says what distance is usual
+    refresh_every: Count  # steps after which, at an episode's end, novelty is updated
+    calibration_states: Count  # the sample for the threshold of distances
     knn_weight: float = Field(ge=0, le=1)  # the density estimator weighs 1 - knn_weight
     density_hidden_units: Units
     density_learning_rate: PositiveFloat = Field(lt=1)
@@ -45,16 +45,12 @@ class NoveltyConfig(Section):
     density_steps: Count  # gradient steps of the density estimator in a refresh
 
     @model_validator(mode="after")
-    def _neighbours_fit(self) -> "NoveltyConfig":
+    def _keys_agree(self) -> "NoveltyConfig":
         if max(self.neighbours) >= self.buffer_size:
             raise ValueError(
                 f"neighbours has {max(self.neighbours)}, which must be less than buffer_size,"
                 f" {self.buffer_size}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _estimator_if_custom(self) -> "NoveltyConfig":
         if (self.kind == "custom") != (self.estimator is not None):
             raise ValueError("estimator and kind: custom go together")
         if self.arguments and self.kind != "custom":
@@ -70,10 +66,7 @@ class CuriosityBonus(Section):
 
 
 class CustomBonus(Section):
-    """A bonus from the class `estimator`, a `mace_rl.bonus.intrinsic.IntrinsicReward`.
-
-    It is made as estimator(spaces, generator, **arguments).
-    """
+    """A `mace_rl.bonus.intrinsic.IntrinsicReward`: estimator(spaces, generator, **arguments)."""
 
     kind: Literal["custom"]
     estimator: Reference

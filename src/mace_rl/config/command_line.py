@@ -1,4 +1,4 @@
-"""What is looked at of Snakemake's command line before Snakemake reads it: profiles/default."""
+"""Snakemake's command line, checked before Snakemake reads it (profiles/default)."""
 
 import argparse
 import sys

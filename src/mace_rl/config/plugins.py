@@ -1,8 +1,7 @@
-"""Code of the user's own that the configuration names as "package.module:Name".
+"""The user's own code, which the configuration names as "package.module:Name".
 
-Modules are looked for where Python finds them and, after that, in the folder that the command is
-given in. Whoever writes a configuration decides what it names. A `run.json` may come from somebody
-else: what it names from outside this package is imported only by leave.
+Modules are looked for where Python finds them, then in the current folder. A `run.json` may come
+from somebody else: what it names from outside this package is imported only if it is trusted.
 """
 
 import importlib
@@ -20,10 +19,9 @@ from mace_rl.config.section import ConfigError, short_repr
 
 
 def code_outside(settings: Any) -> dict[str, str]:
-    """By key, what can name code from outside this package, in plain settings at any depth.
+    """By key, every text in plain settings, arguments too, that may name code from outside.
 
-    That is every text with a ':', as in "package.module:Name" and in the ids of environments, also
-    among arguments, which may get it imported as well.
+    That is every text with a ':', as in "package.module:Name" and ids of environments.
     """
     found, waiting = {}, [("", settings)]
     while waiting:
@@ -39,7 +37,7 @@ def code_outside(settings: Any) -> dict[str, str]:
 
 
 def load(reference: str, key: str) -> Any:
-    """What "package.module:Name" names; `ConfigError` with the `key` that names it if nothing."""
+    """The object at "package.module:Name"; `ConfigError`, with the `key`, if there is none."""
     name = reference.partition(":")[2]
     module = import_module(reference, key)
     if not hasattr(module, name):
@@ -50,11 +48,11 @@ def load(reference: str, key: str) -> Any:
 def make(
     reference: str, key: str, kind: type, functions: bool, /, *given: Any, **arguments: Any
 ) -> Any:
-    """What the class "package.module:Name" makes, called with what is `given` and the `arguments`.
+    """An instance of the class "package.module:Name", made from `given` and `arguments`.
 
-    It has to be a subclass of `kind`; with `functions` also a function that returns a `kind`, but
-    none of Python's or of this package. `ConfigError` for what is neither, before it is called, and
-    for what does not take these arguments, or says so itself.
+    The class has to be a subclass of `kind`. With `functions` it may be a function that returns a
+    `kind`, but none of Python or this package. Raises `ConfigError` for anything else, before
+    calling it, and if it does not take these arguments or raises one itself.
     """
     factory: Any = load(reference, key)
     if isinstance(factory, FunctionType):
@@ -93,10 +91,7 @@ def import_module(reference: str, key: str) -> ModuleType:
 
 
 def source_files(reference: str, key: str) -> list[Path]:
-    """The Python file of the module in "package.module:Name", found without importing it.
-
-    With it come those beside it in a package, which it may share code with.
-    """
+    """The Python file of a module, without importing it; in a package all files in its folder."""
     _look_here_too()
     module = reference.partition(":")[0]
     try:

@@ -1,4 +1,4 @@
-"""Reading YAML, of files and of the command line, and reading one over another."""
+"""Reading YAML from files and the command line, and merging it."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -11,7 +11,7 @@ from mace_rl.config.section import ConfigError, short_repr
 
 Settings = dict[str, Any]
 
-# Every default: in the project the file config.yaml, of which an installation has a copy.
+# The project's config.yaml; an installation has a copy.
 DEFAULTS = Path(__file__).with_name("defaults.yaml").resolve()
 
 
@@ -30,7 +30,7 @@ def read_yaml(path: Path) -> Settings:
 
 
 def read_options(options: Iterable[str]) -> Settings:
-    """What `--config KEY=VALUE ...` says; values are read as in a file, and texts stay as typed."""
+    """The settings in `--config KEY=VALUE ...`, read as in a file; texts stay as typed."""
     settings: Settings = {}
     for option in options:
         key, _, text = option.partition("=")
@@ -43,25 +43,18 @@ def read_options(options: Iterable[str]) -> Settings:
 def merge(
     base: Mapping[str, Any], over: Mapping[str, Any], whole: Collection[str] = ()
 ) -> Settings:
-    """`base` with the values of `over`: mappings merge, all else, and the keys `whole`, replace.
-
-    The same as Snakemake does with `--configfile`.
-    """
+    """`base` with `over` read over it. Mappings merge, but for the keys `whole`."""
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
         if isinstance(below, Mapping) and isinstance(value, Mapping) and key not in whole:
-            merged[key] = merge(below, value)
-        else:
-            merged[key] = value
+            value = merge(below, value)
+        merged[key] = value
     return merged
 
 
 def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
-    """`merge` for settings of runs: `beta` is replaced, and `bonus` if its `kind` is another.
-
-    The keys of one kind mean nothing to another.
-    """
+    """`merge` for settings of runs: `beta` is replaced, and `bonus` if its `kind` changes."""
     bonuses = [bonus for bonus in (base.get("bonus"), over.get("bonus")) if bonus is not None]
     kinds = [bonus.get("kind") for bonus in bonuses if isinstance(bonus, Mapping)]
     same = len(kinds) < 2 or kinds[1] in (kinds[0], None)
@@ -79,9 +72,9 @@ def _read(text: str, origin: str) -> Any:
         raise ConfigError(f"{origin}{place}: not valid YAML: {problem}") from None
 
 
-DEEPEST, MOST = 50, 100_000  # levels of nesting, and values for which aliases stand
+DEEPEST, MOST = 50, 100_000  # levels of nesting, and values that aliases repeat
 
-# What is no text. To YAML 1.1 no, 1_000, 012, 1:30 and dates would be something else, too.
+# Scalars that are not text. In YAML 1.1 no, 1_000, 012, 1:30 and dates would be here, too.
 _SCALARS = [
     (f"tag:yaml.org,2002:{name}", re.compile(rf"({pattern})\Z", re.ASCII))
     for name, pattern in (
@@ -96,17 +89,16 @@ _SCALARS = [
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, with the scalars of YAML 1.2; whatever stands for more is an error.
+    """YAML's safe loader, with the scalars of YAML 1.2.
 
-    That is: a key that occurs twice, a list or mapping as a key, a tag, and what is without end or
-    measure by its depth or its aliases.
+    It refuses repeated keys, lists or mappings as keys, tags, and too much depth or repetition.
     """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self.yaml_implicit_resolvers = {None: _SCALARS}  # whatever the first character
         self.depth = self.count = 0
-        self.sizes: dict[yaml.Node | None, int] = {}  # values in what is read to its end
+        self.sizes: dict[yaml.Node | None, int] = {}  # values in each complete node
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event, before = self.peek_event(), self.count  # type: ignore[no-untyped-call]
@@ -115,7 +107,7 @@ class _Loader(yaml.SafeLoader):
         _refuse(self.depth > DEEPEST, f"more than {DEEPEST} levels", event)
         _refuse(tag is not None, f"the tag {tag!r}", event)
         node = super().compose_node(parent, index)
-        self.count += self.sizes.get(node, MOST) if alias else 0  # MOST: of what it stands in
+        self.count += self.sizes.get(node, MOST) if alias else 0  # MOST: of a node that contains it
         _refuse(alias and self.count > MOST, "aliases that stand for too much", event)
         self.sizes.setdefault(node, self.count - before)
         self.depth -= 1

@@ -1,9 +1,7 @@
 """Everything that determines one training run, typed, frozen and checked once.
 
-The values and their sources (paper, the authors' public code, our choice) stand in `config.yaml`;
-this module, with `agent`, `bonus` and `beta` beside it, says what each one means and which values
-are possible. A `RunConfig` is all a run depends on besides the code: equal `RunConfig`s give equal
-results.
+`config.yaml` has the values and their sources. This module, with `agent`, `bonus` and `beta` beside
+it, says what each means and may be. Equal `RunConfig`s and equal code give equal results.
 """
 
 from collections.abc import Mapping
@@ -18,15 +16,13 @@ from mace_rl.config.section import Arguments, Section
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
-BONUS_SECTIONS = ("bonus", "memory", "novelty")  # what only variants with a bonus use
+BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 
 
-class RunConfig(Section):
-    """One training run: environment, variant, seed and every hyperparameter that it uses.
+class AgentConfig(Section):
+    """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
-    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
-    others, so that a change of what a variant does not use leaves its runs alone.
-    """
+    model_config = Section.model_config | {"extra": "ignore"}
 
     environment: str
     variant: str
@@ -37,6 +33,17 @@ class RunConfig(Section):
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+
+class RunConfig(AgentConfig):
+    """One training run: environment, variant, seed and every hyperparameter that it uses.
+
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    others, so that a change of what a variant does not use leaves its runs alone.
+    """
+
+    model_config = Section.model_config
+
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
@@ -59,11 +66,11 @@ class RunConfig(Section):
         return self
 
     def settings(self) -> dict[str, Any]:
-        """Plain values, as in `run.json`, without what is not used: equal ones, equal results."""
+        """Plain values, as in `run.json`, without unused sections."""
         return {name: value for name, value in self.model_dump().items() if value is not None}
 
     def references(self) -> dict[str, str]:
-        """By key, the code from outside this package that takes part, as package.module:Name."""
+        """By key, the code that the run names as package.module:Name."""
         found = {
             "environment": self.environment if ":" in self.environment else None,
             "ppo.network.module": getattr(self.ppo.network, "module", None),
@@ -75,10 +82,7 @@ class RunConfig(Section):
 
 
 def unused_sections(settings: Any) -> dict[str, str]:
-    """The sections that a run with these settings does not use, each with what in them says so.
-
-    settings: a `RunConfig`, or plain values before they are checked.
-    """
+    """The sections that a run with these settings, plain or checked, does not use, with reasons."""
 
     def value(*keys: str) -> Any:
         found = settings

@@ -1,4 +1,4 @@
-"""What every section of the configuration shares: strictness, and one line for a mistake."""
+"""The base of every section of the configuration: strict types, and one line for a mistake."""
 
 import difflib
 import json
@@ -29,7 +29,7 @@ class Section(BaseModel):
     )
 
 
-# A number of things, for all of which there may have to be room at once.
+# A number of things, which may all have to fit into memory.
 Count = Annotated[int, Field(gt=0, le=10**7)]
 Units = Annotated[int, Field(gt=0, le=10**4)]  # in a layer of a network
 
@@ -40,12 +40,12 @@ def _reference(text: str) -> str:
     return text
 
 
-# Code of the user's own, "package.module:Name"; config/plugins.py says where it is looked for.
+# The user's own code, "package.module:Name"; config/plugins.py says where it is looked for.
 Reference = Annotated[str, AfterValidator(_reference)]
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
-    """With Python's numbers for NumPy's; `ValueError` for what JSON would not give back."""
+    """`value` with Python's numbers for NumPy's; `ValueError` if JSON would change it."""
     value = value.item() if getattr(value, "shape", None) == () else value
     if depth < 100 and isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: _plain(item, depth + 1) for key, item in value.items()}
@@ -60,24 +60,16 @@ def _plain(value: Any, depth: int = 0) -> Any:
     )
 
 
-def _writable(values: dict[str, Any]) -> dict[str, Any]:
-    # ValueError for half a character, and the like.
-    return dict(json.loads(json.dumps(values, ensure_ascii=False).encode()))
-
-
-# Of the user's own code and of environments: what trains is what run.json brings back.
-# (A lambda: pydantic 2.7 would give a second parameter something of its own.)
+# Arguments of the user's own code and of environments, which run.json has to give back unchanged:
+# `encode` raises ValueError for half a character. (A lambda: pydantic 2.7 would set `depth`.)
 Arguments = Annotated[
     dict[str, Annotated[Any, BeforeValidator(lambda value: _plain(value))]],
-    AfterValidator(_writable),
+    AfterValidator(lambda values: json.loads(json.dumps(values, ensure_ascii=False).encode())),
 ]
 
 
 def check(model: type[Model], values: Any, origin: str) -> Model:
-    """Build `model` from `values`, or raise a one-line `ConfigError` for the first mistake.
-
-    `origin` says where the values come from (a file name) and starts the message.
-    """
+    """`model` from `values`; a one-line `ConfigError`, begun by `origin`, for the first mistake."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -114,7 +106,7 @@ def short_repr(value: Any) -> str:
 
 
 def _advice(problem: ErrorDetails) -> str:
-    """For what YAML takes for something else than is meant."""
+    """Advice for a value that YAML reads otherwise than it is meant."""
     wanted, value = problem["type"], problem["input"]
     if wanted == "union_tag_invalid" and problem["ctx"]["tag"] in MOVED:
         return ", and extras/ has this one, as kind: custom (docs/extending.md)"
@@ -132,12 +124,12 @@ def _advice(problem: ErrorDetails) -> str:
 
 
 def _place(model: type[BaseModel], location: tuple[Any, ...]) -> tuple[str, list[str]]:
-    """`location` as the file has it, and the known keys of the section its last element is in."""
+    """`location` as in the file, and the known keys of the section of its last element."""
     names: list[str] = []
     beside = candidates = [model]
     for part in location:
         tagged = [candidate for candidate in candidates if part in _kinds(candidate)]
-        if tagged:  # the member of a union that its `kind` chose, which the file does not name
+        if tagged:  # the `kind` of a member of a union: the file has no such key
             candidates = tagged
             continue
         names.append(str(part))
@@ -156,7 +148,7 @@ def _kinds(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The settings classes in a type: itself, or those of a union's members or a list's values."""
+    """The settings classes in a type, also in a union, list or dict."""
     if get_origin(annotation) in (Union, types.UnionType, Annotated, dict, list):
         return [one for argument in get_args(annotation) for one in _sections(argument)]
     is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
@@ -164,7 +156,7 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
 
 
 def check_known(name: str, known: Iterable[str], key: str, where: str) -> None:
-    """Refuse a name that is not among those `known`, which stand `where`."""
+    """Refuse a name that is not among those `known`, which are defined in `where`."""
     known = list(known)
     if name not in known:
         nearest = difflib.get_close_matches(name, known, n=1)

@@ -1,4 +1,4 @@
-"""The settings of `mace_rl.wrappers`: those of a run that an agent from elsewhere needs."""
+"""The settings of `mace_rl.wrappers`."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -14,25 +14,25 @@ from mace_rl.config.section import Count, Section
 
 @cache
 def defaults() -> dict[str, Any]:
-    """What config.yaml has for `memory` and `novelty`."""
+    """The sections `memory` and `novelty` of config.yaml."""
     training = read_yaml(DEFAULTS)["training"]
     return {section: training[section] for section in ("memory", "novelty")}
 
 
 class CuriosityConfig(Section):
-    """What R_extrinsic + β · R_curiosity depends on where the agent is not ours."""
+    """The settings of R_extrinsic + β · R_curiosity for any agent."""
 
     beta: BetaRule = Field(discriminator="kind")  # a number is that constant
     relevance: bool = True  # False: the bonus is novelty alone, and memory is not used
-    memory: MemoryConfig  # what differs from `defaults`
-    novelty: NoveltyConfig  # what likewise
+    memory: MemoryConfig  # is read over `defaults`, as is the next
+    novelty: NoveltyConfig
     discount: float = Field(default=0.99, ge=0, le=1)  # γ of the agent
     rollout_steps: Count = 1  # steps between updates of the agent
     seed: int = Field(default=0, ge=0, lt=2**32)
 
     @model_validator(mode="before")
     @classmethod
-    def _over_the_study_s(cls, values: dict[str, Any]) -> dict[str, Any]:
+    def _over_defaults(cls, values: dict[str, Any]) -> dict[str, Any]:
         if values.get("relevance") is False and "memory" in values:
             raise ValueError("relevance False does not use memory: one of the two should go")
         for section, default in defaults().items():
@@ -43,12 +43,12 @@ class CuriosityConfig(Section):
 
     @field_validator("beta", mode="before")
     @classmethod
-    def _without_policy_gradients(cls, beta: Any) -> Any:
+    def _not_meta(cls, beta: Any) -> Any:
         if not isinstance(beta, Mapping):
             return {"kind": "constant", "value": beta}
         if beta.get("kind") == "meta":
             raise ValueError(
-                "the meta network learns from policy gradients, which only our trainer has: kind "
-                "should be constant, exponential or custom"
+                "meta-adaptation asks for policy gradients and the budget, which only our trainer "
+                "has: kind should be constant, exponential or custom"
             )
         return beta

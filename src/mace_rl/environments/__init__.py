@@ -1,6 +1,6 @@
 """Environments, and acting in them; importing this registers our own with Gymnasium.
 
-Planning the workflow needs the ids, and neither PyBullet nor numba nor torch: classes are named.
+Classes are given by name: planning the workflow needs the ids without PyBullet, numba and torch.
 """
 
 from contextlib import suppress
@@ -8,46 +8,25 @@ from contextlib import suppress
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-gymnasium.register(
-    "SparseMountainCar-v0", "mace_rl.environments.tasks:SparseMountainCar", max_episode_steps=200
-)
-gymnasium.register(
-    "NoisyMountainCar-v0", "mace_rl.environments.tasks:NoisyMountainCar", max_episode_steps=200
-)
-gymnasium.register(
-    "NoisyDeepSea10-v0",
-    "mace_rl.environments.tasks:NoisyDeepSea",
-    max_episode_steps=10,
-    kwargs={"size": 10, "pages": 1000},
-)
-for size in (10, 20):
-    gymnasium.register(
-        f"DeepSea{size}-v0",
-        "mace_rl.environments.tasks:DeepSea",
-        max_episode_steps=size,
-        kwargs={"size": size},
-    )
-gymnasium.register(
-    "FrozenLake8x8Deterministic-v0",
-    "gymnasium.envs.toy_text.frozen_lake:FrozenLakeEnv",
-    max_episode_steps=200,
-    kwargs={"map_name": "8x8", "is_slippery": False},
-)
-gymnasium.register(
-    "CliffWalking200-v0",
-    "gymnasium.envs.toy_text.cliffwalking:CliffWalkingEnv",
-    max_episode_steps=200,
-)
-gymnasium.register(
-    "BarrenRegion-v0", "mace_rl.environments.tasks:BarrenRegion", max_episode_steps=60
-)
-for name, flag in {"Help": "right", "Harm": "wrong", "Nothing": "random"}.items():
-    gymnasium.register(
-        f"Planted{name}-v0",
-        "mace_rl.environments.planted:Planted",
-        max_episode_steps=32,
-        kwargs={"flag": flag},
-    )
+TASKS, PLANTED = "mace_rl.environments.tasks", "mace_rl.environments.planted:Planted"
+TEXT, EASY = "gymnasium.envs.toy_text", {"map_name": "8x8", "is_slippery": False}
+for name, entry_point, steps, arguments in (
+    ("SparseMountainCar", f"{TASKS}:SparseMountainCar", 200, {}),
+    ("NoisyMountainCar", f"{TASKS}:NoisyMountainCar", 200, {}),
+    ("BarrenRegion", f"{TASKS}:BarrenRegion", 60, {}),
+    ("DeepSea10", f"{TASKS}:DeepSea", 10, {"size": 10}),
+    ("DeepSea20", f"{TASKS}:DeepSea", 20, {"size": 20}),
+    ("NoisyDeepSea6", f"{TASKS}:NoisyDeepSea", 6, {"size": 6, "pages": 500}),
+    ("NoisyDeepSea7", f"{TASKS}:NoisyDeepSea", 7, {"size": 7, "pages": 1000}),
+    ("NoisyDeepSea10", f"{TASKS}:NoisyDeepSea", 10, {"size": 10, "pages": 1000}),
+    ("LateDeepSea7", f"{TASKS}:LateDeepSea", 12, {"size": 7, "pages": 1000}),
+    ("FrozenLake8x8Deterministic", f"{TEXT}.frozen_lake:FrozenLakeEnv", 200, EASY),
+    ("CliffWalking200", f"{TEXT}.cliffwalking:CliffWalkingEnv", 200, {}),
+    ("PlantedHelp", PLANTED, 32, {"flag": "right"}),
+    ("PlantedHarm", PLANTED, 32, {"flag": "wrong"}),
+    ("PlantedNothing", PLANTED, 32, {"flag": "random"}),
+):
+    gymnasium.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=arguments)
 
 
 def registered() -> dict[str, EnvSpec]:

@@ -1,4 +1,7 @@
-"""CartPole-v1 and Acrobot-v1 in compiled code: whole episodes, equal to Gymnasium's to the bit."""
+"""CartPole-v1 and Acrobot-v1 in compiled code: whole episodes, equal to Gymnasium's to the bit.
+
+All arithmetic is in Gymnasium's order.
+"""
 
 import math
 
@@ -12,10 +15,7 @@ CARTPOLE, ACROBOT = 0, 1
 
 @njit(cache=True)
 def step_cartpole(state, action):
-    """One step of Gymnasium's CartPole-v1 in its own order of operations.
-
-    state: float64 [4], advanced in place. Returns (reward, terminated).
-    """
+    """One step of CartPole-v1; changes `state`, float64 [4]; returns (reward, terminated)."""
     x, x_dot, theta, theta_dot = state[0], state[1], state[2], state[3]
     total_mass = 0.1 + 1.0
     polemass_length = 0.1 * 0.5
@@ -38,9 +38,9 @@ def step_cartpole(state, action):
 
 @njit(cache=True)
 def _acrobot_derivatives(state, torque, two):
-    """Time derivatives of the four state variables ("book" equations), all masses, lengths 1.
+    """Time derivatives of the four state variables ("book" equations); masses and lengths are 1.
 
-    `two` is 2.0, kept from the compiler: Gymnasium squares with the C library's `pow`, which
+    `two` is 2.0, unknown to the compiler: Gymnasium squares with the C library's `pow`, which
     differs from x * x in the last bit for about one value in a thousand.
     """
     theta1, theta2, dtheta1, dtheta2 = state
@@ -62,12 +62,8 @@ def _acrobot_derivatives(state, torque, two):
 
 @njit(cache=True)
 def _advance(state, step, derivative):
-    return (
-        state[0] + step * derivative[0],
-        state[1] + step * derivative[1],
-        state[2] + step * derivative[2],
-        state[3] + step * derivative[3],
-    )
+    (a, b, c, d), (da, db, dc, dd) = state, derivative
+    return a + step * da, b + step * db, c + step * dc, d + step * dd
 
 
 @njit(cache=True)
@@ -81,10 +77,7 @@ def _wrap(angle):
 
 @njit(cache=True)
 def step_acrobot(state, action, two):
-    """One step of Gymnasium's Acrobot-v1 in its own order of operations.
-
-    state: float64 [4], advanced in place. Returns (reward, terminated).
-    """
+    """One step of Acrobot-v1; changes `state`, float64 [4]; returns (reward, terminated)."""
     torque = action - 1.0
     start = (state[0], state[1], state[2], state[3])
     k1 = _acrobot_derivatives(start, torque, two)
@@ -107,22 +100,17 @@ def _observe(which, state, observation):
         for i in range(4):
             observation[i] = state[i]
     else:
-        observation[0] = math.cos(state[0])
-        observation[1] = math.sin(state[0])
-        observation[2] = math.cos(state[1])
-        observation[3] = math.sin(state[1])
-        observation[4] = state[2]
-        observation[5] = state[3]
+        observation[0], observation[1] = math.cos(state[0]), math.sin(state[0])
+        observation[2], observation[3] = math.cos(state[1]), math.sin(state[1])
+        observation[4], observation[5] = state[2], state[3]
 
 
 @njit(cache=True)
 def episode(which, state, first_observation, policy, uniforms):
     """One whole episode of CartPole (`which` = 0) or Acrobot (1) from a reset environment's state.
 
-    state: float64 [4], left at the final state; policy: a `CompiledActing`; uniforms: float64
-    [time limit], one a step.
-    Returns observations float32 [T + 1, size], actions int64 [T], log-probabilities float32 [T],
-    rewards float64 [T], terminated.
+    state: float64 [4], overwritten; policy: a `CompiledActing`; uniforms: float64 [time limit], one
+    a step. Returns the fields of an `Episode`.
     """
     limit = uniforms.shape[0]
     two = np.full(1, 2.0)[0]

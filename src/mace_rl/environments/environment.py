@@ -18,15 +18,15 @@ from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
 from mace_rl.outlets import keep_open
 
-# Environments for which we have a faster class that behaves the same to the bit.
+# Faster classes that behave the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
-MOST_STEPS = 10**6  # of an episode: before it, noise is drawn for as many ...
-MOST_NOISE = 10**8  # ... for every number in an action
+MOST_STEPS = 10**6  # of an episode; its noise is drawn before it ...
+MOST_NOISE = 10**8  # ... with so many numbers at most
 
 
 @contextmanager
 def nothing_printed() -> Iterator[None]:
-    """Keep off the terminal what pybullet prints, from C, when it is loaded and connected."""
+    """Hide what pybullet prints, from C, when it is loaded and connected."""
     for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
         keep_open(descriptor)
         with suppress(AttributeError, OSError):  # it is None, or its reader is gone
@@ -45,7 +45,7 @@ def nothing_printed() -> Iterator[None]:
 
 @contextmanager
 def trying_out(what: str) -> Iterator[None]:
-    """Turn what an environment raises here into a `ConfigError`, one line; nothing is printed."""
+    """Print nothing, and turn any error of an environment into a `ConfigError`, one line."""
     try:
         with nothing_printed():
             yield
@@ -62,8 +62,8 @@ def trying_out(what: str) -> Iterator[None]:
 class Environment(Spaces):
     """A Gymnasium environment with its observation size, time limit and random generator.
 
-    `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id, what
-    cannot be made or reset, a missing time limit and unsupported spaces.
+    `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id, an
+    error in making or resetting it, a missing time limit and unsupported spaces.
     """
 
     def __init__(
@@ -103,9 +103,7 @@ class Environment(Spaces):
                 f"environment {name!r} has {self.action_size} numbers in an action, and its "
                 f"time limit is {self.max_steps}, not up to {MOST_NOISE // self.action_size}"
             )
-        # A Bullet environment's first reset averages the robot's position over one part fewer than
-        # later ones, which makes the first reward unlike any other. A throw-away reset lets a fresh
-        # environment with the same generator state replay an aged one to the bit.
+        # A Bullet environment's first reset is unlike later ones: it averages over one part fewer.
         with trying_out(f"environment {name!r}"):
             given: Any = self.env.reset(seed=int(seed.generate_state(1)[0]))
             if not (isinstance(given, tuple) and len(given) == 2):
@@ -114,7 +112,7 @@ class Environment(Spaces):
                 raise TypeError(f"np_random is a {type(kept).__name__}, not a Generator of NumPy's")
 
     def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
-        """Observation, reward and flags that come of an `action`, the `number`th of an episode."""
+        """Observation, reward and flags, checked; `action` is the `number`th of an episode."""
         try:
             observation, reward, terminated, truncated, _ = self.env.step(action)
         except Exception as error:
@@ -132,5 +130,4 @@ class Environment(Spaces):
 
     @property
     def generator(self) -> np.random.Generator:
-        """The environment's own generator."""
         return self.env.unwrapped.np_random

@@ -1,11 +1,8 @@
 """HopperBulletEnv-v0, the same to the bit, about three times as fast.
 
-The library calls the simulator some 25 times a step, for one number or joint at a time, through a
-wrapper that builds a `functools.partial` each time; here a step is six calls. The rest is
-arithmetic on some 40 numbers, and compiled: +, -, *, / give numpy's bits as long as their order is
-the library's and no option, such as numba's `fastmath`, lets the compiler change it. Where numpy or
-BLAS chooses the instructions (sin, cos, arctan2, dot), either the result is exact whatever the
-instructions, or the same numpy function is called.
+The library calls the simulator some 25 times a step, through a slow wrapper; here a step is six
+calls. The rest is compiled arithmetic in the library's order, with numpy's bits. For sin, cos,
+arctan2 and dot either the result is exact, or the same numpy function is called.
 """
 
 import math
@@ -24,7 +21,7 @@ from pybullet_envs_gymnasium.scene_stadium import SinglePlayerStadiumScene
 from mace_rl.numerics.compiling import njit
 
 VERIFIED = {"pybullet": "3.2.7", "pybullet_envs_gymnasium": "0.6.0"}
-# Pybullet's numbers of the robot's parts, in the order in which the library averages positions.
+# Pybullet's numbers of the robot's parts, in the library's order of averaging positions.
 PARTS = {"link0_2": 0, "torso": 3, "link0_3": 1, "link0_4": 2, "link0_6": 4}
 PARTS |= {"thigh": 5, "link0_8": 6, "leg": 7, "link0_10": 8, "foot": 9}
 LINKS = list(PARTS.values())
@@ -32,7 +29,7 @@ JOINTS = {"thigh_joint": 4, "leg_joint": 6, "foot_joint": 8}
 JOINT_NUMBERS = list(JOINTS.values())
 AT_LIMIT = np.float32(0.99)  # the library compares float32 with 0.99, rounded to float32
 BOUND = np.float32(5.0)  # of every number in the state
-write_raw = struct.Struct("42d").pack_into  # numbers into an array, faster than numpy's assignment
+write_raw = struct.Struct("42d").pack_into  # faster than numpy's assignment
 
 
 @njit(cache=True)
@@ -44,10 +41,8 @@ def mean_of_11(v: NDArray[np.float64]) -> float:
 
 @cache
 def numpy_adds_as_assumed() -> bool:
-    """Whether this numpy adds 3 or 11 numbers, and takes a norm, in the order written here.
-
-    The numbers tried differ so much in size that another order gives other bits.
-    """
+    """Whether this numpy adds 3 or 11 numbers, and takes a norm, in the order written here."""
+    # Sizes so different that another order gives other bits.
     rng = np.random.default_rng(0)
     tried = rng.standard_normal((50, 33)) * 10.0 ** rng.integers(-3, 4, (50, 33))
     return all(
@@ -59,33 +54,20 @@ def numpy_adds_as_assumed() -> bool:
 
 
 @njit(cache=True)
-def is_plus_zero(v: float) -> bool:
-    """Whether v is 0.0 and not -0.0."""
-    return v == 0.0 and math.copysign(1.0, v) > 0.0
+def in_plane(dx, dy, yaw, vx, vy, vz):
+    """Whether the hopper moves in the plane y = 0, facing the target; `towards_target` if so.
 
-
-# Direction and distance of the target, sin and cos of the angle to it, speed turned by -yaw.
-TowardsTarget = tuple[float, float, float, float, float, float, float]
-
-
-@njit(cache=True)
-def in_plane(
-    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
-) -> tuple[bool, TowardsTarget]:
-    """Whether the hopper moves in the plane y = 0, facing the target; what follows if so.
-
-    Then every product with dy, vy or yaw is a zero, added to at least one that is 0.0; sin(0),
-    cos(0), arctan2(0, dx) and sqrt(dx * dx) are exact. So it is until the hopper has fallen.
+    Then products with dy, vy or yaw are zeros, each added to a 0.0; sin(0), cos(0), arctan2(0, dx)
+    and sqrt(dx * dx) are exact. This holds until the hopper has fallen.
     """
-    facing = yaw == 0.0 and dy == 0.0 and dx > 0.0 and (vx != 0.0 or is_plus_zero(yaw))
-    holds = facing and is_plus_zero(vy) and math.isfinite(vx + vz)
+    yaw_positive, vy_positive = math.copysign(1.0, yaw) > 0.0, math.copysign(1.0, vy) > 0.0
+    facing = yaw == 0.0 and dy == 0.0 and dx > 0.0 and (vx != 0.0 or yaw_positive)
+    holds = facing and vy == 0.0 and vy_positive and math.isfinite(vx + vz)
     return holds, (dy, dx, dy - yaw, 1.0, vx + 0.0, 0.0, vz + 0.0)
 
 
-def towards_target(
-    dx: float, dy: float, yaw: float, vx: float, vy: float, vz: float
-) -> TowardsTarget:
-    """The same anywhere, as the library has it."""
+def towards_target(dx, dy, yaw, vx, vy, vz):
+    """Angle and distance of the target, sin and cos of the turn to it, speed turned by -yaw."""
     theta = np.arctan2(dy, dx)
     target = np.array((dy, dx))
     sin, cos = np.sin(-yaw), np.cos(-yaw)
@@ -96,21 +78,13 @@ def towards_target(
 
 
 @njit(cache=True)
-def state_in_plane(
-    raw: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    floor_xyz: NDArray[np.float64],
-    target_x: float,
-    target_y: float,
-    initial_z: float,
-    feet_contact: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], int, float, float, bool]:
-    """`robot.calc_state` on the condition of `in_plane`, without which state[1:6] is wrong.
+def state_in_plane(raw, ranges, floor_xyz, target_x, target_y, initial_z, feet_contact):
+    """`robot.calc_state` if `in_plane` holds; otherwise state[1:6] is wrong.
 
     raw: float64 [42], the ten parts' positions [10, 3], the joints' angles and speeds [3, 2], the
     torso's speed [3], roll, pitch and yaw; ranges: the joints' lowest and highest angles, [3, 2].
     Returns the state, float32 [15]; the joints' speeds, float32 [3], and how many joints are at
-    their limits; the parts' mean x and y; and whether the condition holds.
+    their limits; the parts' mean x and y; and whether `in_plane` holds.
     """
     xyz, joints = raw[:30].reshape(10, 3), raw[30:36].reshape(3, 2)
     vx, vy, vz, roll, pitch, yaw = raw[36:]
@@ -152,19 +126,17 @@ class FastHopperBulletEnv(HopperBulletEnv):
     """The library's `HopperBulletEnv`: same constructor, spaces, numbers and random stream.
 
     `fast` says whether the fast path is in use, `fallback_reason` why not ("" if it is). Both are
-    settled once, after the first reset, which is always the library's own. An action that is not
-    a float32 or float64 array of shape (3,) takes the library's step, at any time.
+    decided after the first reset, which is the library's own. An action that is not a float32 or
+    float64 array of shape (3,) takes the library's step.
 
-    Randomness is `robot.np_random`, three uniform draws a reset. `reset(seed=s)` replaces it, and
-    `env.np_random`, by one new generator; assigning `env.np_random` does not reach the robot. To
-    restore a generator, set `robot.np_random.bit_generator.state`. As in the library, the first
-    reward of an instance is off: its first reset averages the positions before the floor is one of
-    the parts. After one throw-away reset, a fresh instance replays an aged one bit for bit.
+    Randomness is `robot.np_random`, three uniform draws a reset. To restore a generator, set its
+    `bit_generator.state`: assigning `env.np_random` does not reach the robot. As in the library,
+    the first reward of an instance is off: its first reset averages positions without the floor.
     """
 
     scene: Any  # the library's, from its first reset on
     robot: Any  # the library's
-    reward: Any  # the library begins with an int and adds floats
+    reward: Any  # an int, to which the library adds floats
     _raw: Any  # float64 [42]; for mypy an ndarray is a buffer from Python 3.12 on
 
     def __init__(self, render_mode: str | None = None) -> None:
@@ -207,10 +179,7 @@ class FastHopperBulletEnv(HopperBulletEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """The library's reset, less what changes nothing from the second one on.
-
-        Left out: switches of a display that is not there, a second reading of the robot's parts.
-        """
+        """The library's reset, from the second one on without what then changes nothing."""
         if not self.fast:
             result = super().reset(seed=seed, options=options)
             if not self._decided:
@@ -274,11 +243,9 @@ class FastHopperBulletEnv(HopperBulletEnv):
         robot.feet_contact[0] = 1.0 if on_ground else 0.0
 
         power, stall = effort(a, robot.joint_speeds)
-        electricity_cost = self.electricity_cost * power
-        electricity_cost += self.stall_torque_cost * stall
-        joints_at_limit_cost = float(self.joints_at_limit_cost * robot.joints_at_limit)
-
-        self.rewards = [self._alive, progress, electricity_cost, joints_at_limit_cost, 0.0]
+        electricity = self.electricity_cost * power + self.stall_torque_cost * stall
+        at_limit = float(self.joints_at_limit_cost * robot.joints_at_limit)
+        self.rewards = [self._alive, progress, electricity, at_limit, 0.0]
         self.HUD(state, a, done)
         reward = sum(self.rewards)
         self.reward += reward
@@ -303,15 +270,10 @@ class FastHopperBulletEnv(HopperBulletEnv):
         # By a slip in `BodyPart.speed`, the library's vy is the torso's turning speed about z.
         velocity = vx, turning[2], vz
         write_raw(self._raw, 0, *raw, *velocity, *robot.body_rpy)
-        target_x, target_y = robot.walk_target_x, robot.walk_target_y
+        target = target_x, target_y = robot.walk_target_x, robot.walk_target_y
+        fixed = self._ranges, self._floor_xyz, *target, robot.initial_z, robot.feet_contact
         state, robot.joint_speeds, robot.joints_at_limit, x, y, holds = state_in_plane(
-            self._raw,
-            self._ranges,
-            self._floor_xyz,
-            target_x,
-            target_y,
-            robot.initial_z,
-            robot.feet_contact,
+            self._raw, *fixed
         )
         theta, distance = dy, dx = target_y - y, target_x - x
         if not holds:

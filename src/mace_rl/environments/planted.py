@@ -1,13 +1,13 @@
 """Planted problems: tasks in which it is known what β should do, to test whatever sets it.
 
-Each step shows one of a few contexts, in which one of two actions is right and pays 1 on average,
-with much noise. An entropy bonus (`config/planted.yaml`) keeps the policy from being sure, so that
-there is something to learn until the end. Beside the context the observation has a flag, and
-`FlagNovelty` pays a bonus for nothing but it:
+Each step shows one of four contexts. In each, one of two actions is right and pays 1 on average,
+with much noise. An entropy bonus (`config/planted.yaml`) keeps the policy from becoming sure, so
+that it learns until the end. The observation also has a flag, and the bonus is the flag alone
+(`mace_rl.bonus.flag`):
 
-- PlantedHelp-v0: it is up after a right action, so the bonus tells without noise what the reward
-  tells with it, and β should rise;
-- PlantedHarm-v0: it is up after a wrong action, the bonus teaches the opposite, and β should fall;
+- PlantedHelp-v0: the flag is up after a right action. The bonus says without noise what the reward
+  says with it, and β should rise.
+- PlantedHarm-v0: it is up after a wrong action. The bonus teaches the opposite, and β should fall.
 - PlantedNothing-v0: it is up at random, and β should stay where it is.
 """
 
@@ -16,8 +16,6 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-
-from mace_rl.bonus.novelty import Novelty
 
 CONTEXTS = 4
 NOISE = 2.0  # standard deviation of the reward
@@ -31,11 +29,8 @@ class Planted(gymnasium.Env[np.ndarray, np.int64]):
     def __init__(self, flag: Literal["right", "wrong", "random"]) -> None:
         self.flag = flag
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode."""
-        super().reset(seed=seed)
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(**kwargs)
         return self.observe(False), {}
 
     def observe(self, flag: bool) -> np.ndarray:
@@ -52,24 +47,3 @@ class Planted(gymnasium.Env[np.ndarray, np.int64]):
         coin = self.np_random.random() < 0.5  # drawn in each problem, so that they stay alike
         flag = {"right": right, "wrong": not right, "random": coin}[self.flag]
         return self.observe(flag), reward, False, False, {}
-
-
-class FlagNovelty(Novelty):
-    """The flag itself; nothing is ever known."""
-
-    def __init__(self, size: int, generator: np.random.Generator) -> None:
-        pass
-
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        """See `Novelty`."""
-        return states[:, -1].astype(np.float64)
-
-    def observe(self, states: np.ndarray) -> None:
-        """See `Novelty`."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Novelty`."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Novelty`."""

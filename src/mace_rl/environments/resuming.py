@@ -1,4 +1,4 @@
-"""What an environment draws from and remembers: saved for resuming, and checked by a replay."""
+"""The state of an environment: saved for resuming, checked by playing the last episodes again."""
 
 import copy
 import hashlib
@@ -17,8 +17,10 @@ OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermo
 
 
 def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
-    """All that can be known of what the next episode depends on: the environment's generator, what
-    its own `state_dict()` says if it has one, and the generators `of_process`, which takes longer.
+    """What the next episode depends on, as far as it can be known.
+
+    The environment's generator, its own `state_dict()` if any, and, which takes longer, the global
+    generators if `of_process`.
     """
     env: Any = environment.env
     offers = all(map(env.has_wrapper_attr, OFFERED))
@@ -34,7 +36,7 @@ def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any
 
 
 def set_state(environment: Environment, state: dict[str, Any]) -> None:
-    """Let environment and process go on from what `state_of` returned."""
+    """Restore what `state_of` returned."""
     env: Any = environment.env
     if state["own"] is not None:
         env.get_wrapper_attr("load_state_dict")(copy.deepcopy(state["own"]))
@@ -46,9 +48,9 @@ def set_state(environment: Environment, state: dict[str, Any]) -> None:
 
 
 class LastEpisodes:
-    """The last episodes: the state before each, its actions, and what came of them.
+    """The last episodes: the state before each, its actions, and a digest of its outcome.
 
-    They are in two blocks. The generators of the process are saved before the first of a block.
+    They are in two blocks. The global generators are saved before the first episode of a block.
     """
 
     def __init__(self) -> None:
@@ -56,24 +58,21 @@ class LastEpisodes:
         self.start: dict[str, Any] = {}
 
     def begin(self, environment: Environment) -> None:
-        """An episode is to be played."""
+        """Before an episode."""
         block = self.blocks[-1]
         if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
             self.blocks = [block, []]
         self.start = state_of(environment, of_process=not self.blocks[-1])
 
     def end(self, episode: Episode) -> None:
-        """It has been played."""
+        """After an episode."""
         actions = torch.from_numpy(episode.actions)
         one = {"start": self.start, "actions": actions, "outcome": _digest(episode)}
         self.blocks[-1].append(one)
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
-    """How a fresh environment, given their actions again, plays episodes otherwise; "" if not.
-
-    blocks: of `LastEpisodes`. What it kept from them for later it then has kept again.
-    """
+    """What is different if a new environment plays `LastEpisodes.blocks` again; "" if nothing."""
     for one in itertools.chain.from_iterable(blocks):
         set_state(environment, one["start"])
         try:
@@ -85,9 +84,7 @@ def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]])
     return ""
 
 
-class _Again:
-    """A policy whose noise are the actions to take."""
-
+class _Again:  # an `ActingPolicy` whose noise are the actions to take
     def act(self, observation: np.ndarray, noise: Any) -> tuple[Any, np.float32]:
         return (noise if isinstance(noise, np.ndarray) else int(noise)), np.float32(0)
 
@@ -98,8 +95,7 @@ def _digest(episode: Episode) -> str:
     return hashlib.sha256(b"".join((part + 0).tobytes() for part in parts)).hexdigest()
 
 
-def _plain(state: Any) -> Any:
-    """A NumPy generator's state with lists for its arrays."""
+def _plain(state: Any) -> Any:  # a NumPy generator's state with lists for its arrays
     if isinstance(state, dict):
         return {key: _plain(value) for key, value in state.items()}
     return state.tolist() if isinstance(state, np.ndarray) else state

@@ -1,7 +1,6 @@
-"""Acting: one episode with the current policy.
+"""Playing one episode with a policy, by stepping any environment.
 
-`roll_out` steps any environment; CartPole-v1 and Acrobot-v1 run in one compiled loop instead,
-which gives the same episode to the bit. Callers cannot tell which one ran.
+CartPole-v1 and Acrobot-v1 run in one compiled loop, which gives the same episode to the bit.
 """
 
 from collections.abc import Callable
@@ -35,11 +34,9 @@ class Episode:
 
 
 def draw_noise(environment: Environment, generator: np.random.Generator) -> np.ndarray:
-    """The random numbers that turn policy outputs into actions, for a whole episode.
+    """The random numbers that turn policy outputs into actions, up to the time limit.
 
-    Drawn before the episode and always up to the time limit, so that both rollouts use up the
-    stream alike. Uniform, [max_steps], for Discrete actions; else standard normal,
-    [max_steps, actions].
+    Uniform, [max_steps], for Discrete actions; else standard normal, [max_steps, actions].
     """
     if isinstance(environment.action_space, gymnasium.spaces.Discrete):
         return generator.random(environment.max_steps)
@@ -54,27 +51,20 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
     log_probs = np.empty(len(noise), np.float32)
     rewards = np.empty(len(noise))
-    vector = observations[0]
-    vector[:] = environment.encode(environment.env.reset()[0], 0)
+    observations[0] = environment.encode(environment.env.reset()[0], 0)
     terminated = truncated = False
     t = 0
     while not (terminated or truncated):
         action: Any
-        action, log_prob = policy.act(vector, noise[t])
+        action, log_prob = policy.act(observations[t], noise[t])
         env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
         observation, reward, terminated, truncated = environment.step(env_action, t + 1)
         actions[t], log_probs[t], rewards[t] = action, log_prob, reward
         t += 1
-        vector = observations[t]
-        vector[:] = environment.encode(observation, t)
+        observations[t] = environment.encode(observation, t)
     # Copies: an episode that ended early should not hold the memory of a whole one.
-    return Episode(
-        observations=observations[: t + 1].copy(),
-        actions=actions[:t].copy(),
-        log_probs=log_probs[:t].copy(),
-        rewards=rewards[:t].copy(),
-        terminated=terminated,
-    )
+    states, actions, log_probs = observations[: t + 1].copy(), actions[:t].copy(), log_probs[:t]
+    return Episode(states, actions, log_probs.copy(), rewards[:t].copy(), terminated)
 
 
 def roll_out_compiled(
@@ -85,11 +75,8 @@ def roll_out_compiled(
     inner: Any = environment.env.unwrapped
     cartpole = isinstance(inner, CartPoleEnv)
     which = classic_control.CARTPOLE if cartpole else classic_control.ACROBOT
-    episode = Episode(
-        *classic_control.episode(
-            which, np.array(inner.state, np.float64), observation, policy, noise
-        )
-    )
+    state = np.array(inner.state, np.float64)
+    episode = Episode(*classic_control.episode(which, state, observation, policy, noise))
     require_finite("an observation", episode.observations, too_large=TOO_LARGE)
     return episode
 
@@ -103,10 +90,9 @@ def rollout_for(
 
 
 def fallback_reason(environment: Environment) -> str:
-    """Why the fast path made for this environment cannot be taken; "" if it can or there is none.
+    """Why this environment's fast path cannot be taken; "" if it can or there is none.
 
-    Compiled episodes have to take the same steps as the environment, which is tried here: other
-    parameters, another version or a C library with another sine all end in the ordinary rollout.
+    Other parameters, another version or a C library with another sine need the ordinary rollout.
     """
     inner: Any = environment.env.unwrapped
     if _is_compiled(environment):
@@ -120,11 +106,7 @@ def _is_compiled(environment: Environment) -> bool:
 
 
 def takes_compiled_steps(inner: Any) -> bool:
-    """Whether a few hundred steps, anywhere in the state space, equal the compiled ones.
-
-    inner: a CartPoleEnv or AcrobotEnv. Every episode starts with a reset, so the states set here
-    leave no trace.
-    """
+    """Whether 300 steps of a CartPoleEnv or AcrobotEnv, from anywhere, equal the compiled ones."""
     states = np.random.default_rng(0)
     generator = inner.np_random.bit_generator.state
     same = True

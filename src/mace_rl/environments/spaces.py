@@ -1,7 +1,4 @@
-"""What the spaces of an environment mean here: observations are vectors.
-
-And what an environment gives is checked here, as it comes in.
-"""
+"""Spaces as agents see them: observations are vectors. All that environments return is checked."""
 
 from contextlib import suppress
 from typing import Any
@@ -13,15 +10,14 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
-MOST_NUMBERS = 10**6  # in an observation or an action: every network has a row for each
-NUMBERS = "biuf"  # NumPy's kinds of them
+MOST_NUMBERS = 10**6  # in an observation or an action: networks have a row for each
+NUMBERS = "biuf"  # NumPy's kinds of numbers
 
 
 class Spaces:
-    """Observations and actions of an environment.
+    """The spaces of an environment; `name` is for messages. `ConfigError` for unsupported ones.
 
-    Observations are flat float32 vectors; a Discrete observation becomes a one-hot vector. `name`
-    is for messages. Raises `ConfigError` for unsupported spaces.
+    Observations become flat float32 vectors, Discrete ones one-hot vectors.
     """
 
     def __init__(
@@ -31,14 +27,13 @@ class Spaces:
         self.given_space = observations  # of what `encode` gets
         if isinstance(observations, Dict | Tuple):
             observations = gymnasium.spaces.flatten_space(observations)
-        if not (
-            isinstance(actions, Discrete) or (isinstance(actions, Box) and len(actions.shape) == 1)
-        ):
+        box = isinstance(actions, Box) and len(actions.shape) == 1
+        if not (box or isinstance(actions, Discrete)):
             raise ConfigError(
                 f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box work"
             )
         require_size(name, actions)
-        assert isinstance(observations, Box | Discrete)
+        assert isinstance(observations, Box | Discrete) and isinstance(actions, Box | Discrete)
         self.name = name
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
@@ -46,10 +41,10 @@ class Spaces:
         self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
 
     def encode(self, observation: Any, step: int | None = None) -> np.ndarray:
-        """`observation` as a float32 vector, [observation_size]; may be the same memory.
+        """`observation` as a float32 vector, [observation_size]; may share its memory.
 
-        step: after which it came, for messages; 0 is the reset. Raises `ConfigError` for what is
-        not of the space, and `NonFiniteError` for numbers that nothing can be learned from.
+        step: the step that returned it, for messages; 0 is the reset. Raises `ConfigError` unless
+        it is of the space, and `NonFiniteError` for numbers that are not finite or too large.
         """
         space, given = self.observation_space, _array(observation, self.given_space)
         if isinstance(space, Discrete):
@@ -73,10 +68,7 @@ class Spaces:
         )
 
     def number(self, what: str, value: Any, step: int) -> float:
-        """A reward or a flag that came of a step, counted from 1; `ConfigError` if it is neither.
-
-        Arrays of one are taken for what is in them.
-        """
+        """A reward or flag of a step, counted from 1; `ConfigError` unless it is one number."""
         if type(value) is float or type(value) is bool:
             return value
         if (found := _only(_array(value))) is None:
@@ -94,7 +86,7 @@ class Spaces:
 
 
 def require_vectors(name: str, space: gymnasium.Space[Any], parts: bool = False) -> None:
-    """Raise `ConfigError` for observations that are no vectors; parts: of a Dict or Tuple."""
+    """Raise `ConfigError` unless observations are vectors; parts: of a Dict or Tuple."""
     if parts and isinstance(space, Dict | Tuple) and len(space):
         for part in space.values() if isinstance(space, Dict) else space:
             require_vectors(name, part, parts=True)
@@ -111,7 +103,7 @@ def require_vectors(name: str, space: gymnasium.Space[Any], parts: bool = False)
 
 
 def require_size(name: str, space: gymnasium.Space[Any]) -> None:
-    """Raise `ConfigError` for a space of vectors without, or with too many numbers."""
+    """Raise `ConfigError` for vectors with no or too many numbers."""
     size = int(gymnasium.spaces.flatdim(space))
     if not 1 <= size <= MOST_NUMBERS:
         raise ConfigError(
@@ -121,8 +113,8 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
 
 
 def _array(given: Any, space: gymnasium.Space[Any] | None = None) -> np.ndarray:
-    """As an array, of a Dict or Tuple a vector; without a number if it is none."""
-    # So say NumPy, PyTorch and Gymnasium that it is none.
+    """As an array, a vector for a Dict or Tuple; an array without numbers if that is impossible."""
+    # NumPy, PyTorch and Gymnasium raise these if it is.
     with suppress(AttributeError, LookupError, TypeError, ValueError, RuntimeError):
         if not isinstance(space, Dict | Tuple):
             return np.asarray(given)
@@ -132,7 +124,7 @@ def _array(given: Any, space: gymnasium.Space[Any] | None = None) -> np.ndarray:
 
 
 def _has_parts(given: Any, space: gymnasium.Space[Any]) -> bool:
-    """Whether each part is of its size and each state known: `flatten` takes -1 for the last."""
+    """Whether each part has its size and each state exists: `flatten` takes -1 for the last."""
     match space:
         case Dict():
             return all(_has_parts(given[name], part) for name, part in space.items())
@@ -146,7 +138,7 @@ def _has_parts(given: Any, space: gymnasium.Space[Any]) -> bool:
 
 
 def _only(values: np.ndarray) -> Any:
-    """The number in an array of one; None where there is none, or are more."""
+    """The number in an array of one; None for other arrays."""
     return values.item() if values.size == 1 and values.dtype.kind in NUMBERS else None
 
 

@@ -1,15 +1,15 @@
 """Exploration tasks: environments in which random actions hardly ever see a reward.
 
-    id                              return of solving it; what makes it hard
-    SparseMountainCar-v0            1; the reward comes at the goal only
-    DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
-    FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
-    CliffWalking200-v0              -13; what random actions find is the cliff, at -100 a fall
-    BarrenRegion-v0                 1; novelty without end lies elsewhere
-    NoisyMountainCar-v0             1; the same, as a television that an action switches on
-    NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
-
-Whatever an environment remembers beside its generator is of the current episode.
+id                              return of solving it; what makes it hard
+SparseMountainCar-v0            1; the reward comes at the goal only
+DeepSea10-v0, DeepSea20-v0      0.99; one sequence of 10 or 20 actions, each step against a cost
+FrozenLake8x8Deterministic-v0   1; 14 steps without a mistake, holes around
+CliffWalking200-v0              -13; random actions find the cliff, at -100 a fall
+BarrenRegion-v0                 1; endless novelty elsewhere
+NoisyMountainCar-v0             1; the same, as a television that an action switches on
+NoisyDeepSea10-v0               0.99; the same, as an archive beside the start
+NoisyDeepSea6-v0, …7-v0         0.99; an archive much larger than the sea: a bonus does harm
+LateDeepSea7-v0                 0.99; an archive beside the goal: the right β changes
 """
 
 from typing import Any, ClassVar
@@ -24,7 +24,6 @@ class SparseMountainCar(MountainCarEnv):
     """Gymnasium's MountainCar-v0 with reward 1 for reaching the goal and 0 until then."""
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Gymnasium's step, under another reward."""
         state, _, terminated, truncated, info = super().step(action)
         return state, float(terminated), terminated, truncated, info
 
@@ -33,7 +32,7 @@ class NoisyMountainCar(SparseMountainCar):
     """SparseMountainCar with a noisy television, which a fourth action watches.
 
     Watching (3) is coasting, and costs 0.001. Observation: position and velocity as in Gymnasium,
-    then what is on: after watching a fresh uniform number in [-1, 1], otherwise 0; float32 [3].
+    then the picture: a new uniform number in [-1, 1] after watching, otherwise 0; float32 [3].
     """
 
     WATCH, COAST = 3, 1
@@ -44,15 +43,11 @@ class NoisyMountainCar(SparseMountainCar):
         low, high = (np.append(x, np.float32(end)) for x, end in ((self.low, -1), (self.high, 1)))
         self.observation_space = Box(low, high, dtype=np.float32)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Gymnasium's reset; the television is off."""
-        state, info = super().reset(seed=seed, options=options)
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        state, info = super().reset(**kwargs)
         return np.append(state, np.float32(0)), info
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """SparseMountainCar's step, and the television."""
         watching = action == self.WATCH
         action = self.COAST if watching else action
         state, reward, terminated, truncated, info = super().step(action)
@@ -64,9 +59,9 @@ class DeepSea(gymnasium.Env):
     """Deep Sea (Osband et al. 2020, bsuite), deterministic: `size` × `size` cells, start top left.
 
     Every step leads one row down, and one column left or right as far as there is one. Right costs
-    0.01 / `size`; right in the last column, which only right all the way leads to, gives 1 as well.
-    The returns are thus 0.99 or at most 0. Which action is right is drawn for every cell, from
-    bsuite's seed: one fixed task, the same as bsuite's for every seed of the environment.
+    0.01 / `size`. Right in the last column, which only right all the way leads to, also gives 1. So
+    returns are 0.99 or at most 0. bsuite's seed, not the environment's, draws for every cell which
+    action is right.
 
     Observation: the number of the cell, row by row; `size`² after the last step.
     """
@@ -81,16 +76,12 @@ class DeepSea(gymnasium.Env):
         mapping = np.random.RandomState(self.MAPPING_SEED).binomial(1, 0.5, (size, size))
         self.right: list[int] = mapping.ravel().tolist()  # the action, for each cell
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
-        """To the top left."""
-        super().reset(seed=seed)
+    def reset(self, **kwargs: Any) -> tuple[int, dict[str, Any]]:
+        super().reset(**kwargs)
         self.row = self.column = 0
         return 0, {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """One row down."""
         reward = 0.0
         if action == self.right[self.row * self.size + self.column]:
             reward = float(self.column == self.size - 1) - 0.01 / self.size
@@ -104,11 +95,11 @@ class DeepSea(gymnasium.Env):
 
 
 class NoisyDeepSea(DeepSea):
-    """DeepSea with an archive of `pages` pages beside its start, full of news and without reward.
+    """DeepSea with an archive of `pages` pages beside its start: much novelty, no reward.
 
-    In the first row a third action leads into the archive, and the rest of the episode is spent
-    there: whatever the action, each step costs 0.001 and shows a page drawn anew. Elsewhere the
-    third action does what 0 does. An archive of 1000 pages has ten times as much news as 55 cells.
+    In the first row a third action leads into the archive for the rest of the episode: whatever the
+    action, each step costs 0.001 and shows a random page. Elsewhere the third action does what 0
+    does.
 
     Observation: the number of the cell as in DeepSea, `size`² after the last step; then the pages.
     """
@@ -119,15 +110,11 @@ class NoisyDeepSea(DeepSea):
         self.observation_space = Discrete(self.cells + pages)
         self.action_space = Discrete(3)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
-        """To the top left."""
+    def reset(self, **kwargs: Any) -> tuple[int, dict[str, Any]]:
         self.reading = False
-        return super().reset(seed=seed, options=options)
+        return super().reset(**kwargs)
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """One row down, or another page."""
         self.reading |= action == 2 and self.row == 0
         if not self.reading:
             return super().step(action % 2)
@@ -136,26 +123,42 @@ class NoisyDeepSea(DeepSea):
         return page, -0.001, self.row == self.size, False, {}
 
 
+class LateDeepSea(NoisyDeepSea):
+    """DeepSea with an archive of `pages` pages beside its goal: the right β changes.
+
+    In the last two cells of the diagonal a third action leads into the archive, where each step
+    costs 0.001 and shows a page drawn anew, until the time limit. Elsewhere the third action does
+    what 0 does. Without a bonus the diagonal is hardly found; if the bonus stays large, the policy
+    that has found it turns aside for news.
+
+    Observation: as in NoisyDeepSea.
+    """
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """One row down, or another page."""
+        self.reading |= action == 2 and self.row == self.column >= self.size - 2
+        if not self.reading:
+            return DeepSea.step(self, action % 2)
+        page = self.cells + int(self.np_random.integers(self.pages))
+        return page, -0.001, False, False, {}
+
+
 class BarrenRegion(gymnasium.Env):
-    """A corridor that leads to the reward, and a room full of news that never does.
+    """A corridor that leads to the reward, and a room with endless novelty that does not.
 
-    From the start S it is one step east to the room (~), where every step costs 0.001, and twenty
-    steps west, north and back east, along four bends, to the goal (G), which gives 1 and ends the
-    episode. Actions 0 to 3 go north, east, south and west, or nowhere if there is a wall (#). In
-    the room the observation has a screen with new random numbers every step; elsewhere its `screen`
-    numbers are 0.
+    From the start (S) one step east leads to the room (~), where every step costs 0.001. Twenty
+    steps west, north and east lead to the goal (G), which gives 1 and ends the episode. Actions 0
+    to 3 go north, east, south and west, or nowhere if there is a wall (#). In the room the
+    observation has a screen with new random numbers every step; elsewhere these are 0.
 
-    - PPO learns to leave the room, for its cost, and seldom strays as far as the goal.
-    - Novelty alone can outweigh the cost, as the screen never shows the same twice.
-    - With novelty × relevance the room is new at first too. But one number, unlike an image, is
-      soon like one that memory holds, and nothing good came of that: less of the room's bonus is
-      left against the cost, while what lies ahead in the corridor is like nothing remembered.
+    - PPO should learn to leave the room, for its cost, and seldom reach the goal.
+    - Novelty alone can outweigh the cost, as the screen never repeats.
+    - With novelty × relevance the screen's numbers soon resemble remembered ones of no use, while
+      the corridor ahead resembles none. docs/study.md has what came out.
 
-    So it was meant; docs/study.md has what came out.
+    `screen=0` is the control: no numbers, so novelty alone should do well.
 
-    `screen=0` is the control: the same room without news, where novelty alone should do well.
-
-    Observation: east and north of the map's middle, each from -1 to 1; then the screen, uniform in
+    Observation: east and north of the map's middle, each from -1 to 1; then `screen` numbers in
     [-1, 1]; float32 [2 + screen].
     """
 
@@ -183,16 +186,12 @@ class BarrenRegion(gymnasium.Env):
         self.observation_space = Box(-1, 1, (2 + screen,), np.float32)
         self.action_space = Discrete(len(self.MOVES))
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """To the start."""
-        super().reset(seed=seed)
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(**kwargs)
         self.cell = self.kinds.index("S")
         return self._observe(), {}
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One cell on, or none."""
         self.cell = self.next[self.cell][action]
         kind = self.kinds[self.cell]
         return self._observe(), self.REWARD.get(kind, 0.0), kind == "G", False, {}

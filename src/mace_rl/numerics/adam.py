@@ -1,7 +1,7 @@
-"""Adam, the optimiser of every network here.
+"""Adam (Kingma & Ba 2015), compiled.
 
-Written out because loading PyTorch's costs every run a second and 70 MB, and a call of it more
-than the rest of a small network's update.
+PyTorch's takes every run a second and 70 MB to load. A call of it takes longer than the rest of a
+small network's update.
 """
 
 import math
@@ -17,7 +17,7 @@ DECAY_MEAN, DECAY_SQUARE, EPSILON = 0.9, 0.999, 1e-5  # β₁, β₂ and ε
 
 
 class AdamState(NamedTuple):
-    """What one step reads and, but for the rate and the norm, changes in place."""
+    """What one step takes beside the gradient; it changes the arrays in place."""
 
     parameters: np.ndarray  # float32 [n], like the next two
     mean: np.ndarray  # running estimates of the gradient's moments
@@ -33,16 +33,12 @@ class Adam(Stateful):
     STATE = ("parameters", "mean", "square", "decayed")
 
     def __init__(
-        self,
-        parameters: np.ndarray,
-        learning_rate: float,
-        max_gradient_norm: float = math.inf,
+        self, parameters: np.ndarray, learning_rate: float, max_gradient_norm: float = math.inf
     ) -> None:
         self.parameters = parameters
-        self.learning_rate = learning_rate
-        self.max_gradient_norm = max_gradient_norm
-        self.mean, self.square = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
-        self.decayed = np.ones(2)  # β₁ᵗ and β₂ᵗ after t steps
+        self.rates = learning_rate, max_gradient_norm
+        self.mean, self.square = np.zeros_like(parameters), np.zeros_like(parameters)
+        self.decayed = np.ones(2)
 
     def step(self, gradient: np.ndarray) -> float:
         """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
@@ -50,24 +46,23 @@ class Adam(Stateful):
 
     @property
     def state(self) -> AdamState:
-        """What the compiled `step` takes beside the gradient."""
-        moments = self.mean, self.square, self.decayed
-        return AdamState(self.parameters, *moments, self.learning_rate, self.max_gradient_norm)
+        """For the compiled `step`."""
+        return AdamState(self.parameters, self.mean, self.square, self.decayed, *self.rates)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """`direction`, [n], in the units in which this optimiser steps: over √v̂ + ε, float32 [n].
 
-        v̂ is the second moment after the steps so far; before the first one nothing is known of it
-        and the direction is returned.
+        v̂ is the second moment. Before the first step it is not known: the direction is returned.
         """
         if self.decayed[1] == 1:
             return direction
-        return preconditioned(direction, self.square, np.float32(1 - self.decayed[1]))
+        unbiased = self.square / np.float32(1 - self.decayed[1])
+        return direction / (np.sqrt(unbiased) + np.float32(EPSILON))
 
 
 @kernel
 def step(gradient, state):
-    """One step of Adam (Kingma & Ba 2015, algorithm 1), in place; see `Adam.step`."""
+    """One step of Adam (algorithm 1), in place; see `Adam.step`."""
     parameters, mean, square, decayed, learning_rate, max_gradient_norm = state
     norm = math.sqrt(dot(gradient, gradient))
     clipped = np.float32(max_gradient_norm / norm if norm > max_gradient_norm else 1)
@@ -83,12 +78,3 @@ def step(gradient, state):
         square[i] = keep_square * square[i] + add_square * slope * slope
         parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(EPSILON))
     return norm
-
-
-@kernel
-def preconditioned(direction, square, unbiased):
-    """`Adam.preconditioned` with the running estimate of squares, which is so much too small."""
-    result = np.empty_like(direction)
-    for i in range(len(result)):
-        result[i] = direction[i] / (math.sqrt(square[i] / unbiased) + np.float32(EPSILON))
-    return result

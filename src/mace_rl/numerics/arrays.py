@@ -1,4 +1,4 @@
-"""Sums, moments, quantiles and permutations of arrays: loops in a written order."""
+"""Sums, moments, quantiles and permutations of arrays: loops in a fixed order."""
 
 import math
 
@@ -50,10 +50,7 @@ def quantile(values: np.ndarray, share: float) -> float:
 
 @kernel
 def shuffled(draws: np.ndarray) -> np.ndarray:
-    """Permutations of N, int64 [K, N], by Fisher and Yates, from draws in [0, 1), [K, N].
-
-    The k-th is uniform if the draws are; a draw of almost 1 leaves a place as it is.
-    """
+    """K permutations by Fisher and Yates from uniform draws, [K, N]; draws of 1 change nothing."""
     order = np.empty(draws.shape, np.int64)
     for k in range(len(draws)):
         for n in range(draws.shape[1]):

@@ -1,8 +1,7 @@
 """numba's `njit`, with a cache on disk that notices every edit of this package.
 
-numba's own does not notice an edit in another file than the cached function's. So each state of
-this package gets a folder to itself, set while a function of ours is decorated and not longer: what
-else is compiled in this process, a program of somebody's, has its cache where it had it.
+numba's own notices edits only in the file of the cached function. So each version of this package
+gets its own folder, which is set only while a function of ours is decorated.
 """
 
 import logging
@@ -22,8 +21,8 @@ from mace_rl.sources import PACKAGE, digest
 config: Any = numba.config  # which it fills as it is imported
 if config.DISABLE_JIT:
     raise Refusal("NUMBA_DISABLE_JIT is set, but this code runs compiled only: unset it")
-# Where this cannot be written, numba takes the user's folder for caches.
-# Not config.CACHE_DIR, which a .numba_config.yaml in the current folder sets: what is there is run.
+# If this cannot be written, numba takes the user's folder for caches. config.CACHE_DIR is not read:
+# a .numba_config.yaml in the current folder sets it, and what is there is run.
 FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__" / "numba")
 FOLDER /= digest("everything")[:16]
 
@@ -46,12 +45,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-@cache  # says it once
+@cache  # so it warns once
 def spare_folder() -> str:
-    """Where neither `FOLDER` nor the user's own can be written: one that others cannot write.
-
-    numba runs what it finds there.
-    """
+    """A temporary folder that only this user can write, since numba runs what it finds there."""
     folder = Path(tempfile.gettempdir(), f"mace-rl-numba-{os.getuid()}")
     folder.mkdir(mode=0o700, exist_ok=True)
     found = folder.lstat()
@@ -62,5 +58,5 @@ def spare_folder() -> str:
     return str(folder / FOLDER.name)
 
 
-# Division by zero is Inf, not an error, which would keep loops from becoming vector operations.
+# Division by zero gives Inf: an error would keep loops from becoming vector operations.
 kernel = njit(cache=True, error_model="numpy")

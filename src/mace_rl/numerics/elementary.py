@@ -1,12 +1,12 @@
 """exp, log and tanh of float32 as written-out arithmetic, and the fused multiply-add.
 
-The C library's functions, NumPy's and LLVM's choose by the processor how they compute, so their
-last bits differ. These are sums and products in a written order, the same bits everywhere, without
-branches, so that loops over them become vector operations. NaN stays NaN: a run that goes bad is
-noticed by it. (Mind the order of arguments to min and max.)
+The functions of the C library, NumPy and LLVM depend on the processor in their last bits. These are
+sums and products in a fixed order, the same bits everywhere. They have no branches, so loops over
+them become vector operations. NaN stays NaN, by the order of the arguments to min and max.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,33 +37,27 @@ def fma(context: Any, a: Any, b: Any, c: Any) -> Any:
     return a(a, b, c), codegen
 
 
-@intrinsic
-def bits_of(context: Any, x: Any) -> Any:
-    """The bits of a float32 as int32."""
+def unary(result: Any, kind: Any, code: Callable[[Any, Any], Any]) -> Any:
+    """A compiled function kind → result by LLVM's `code`, of a builder and the argument."""
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(32))
+    @intrinsic
+    def function(context: Any, x: Any) -> Any:
+        return result(kind), lambda context, builder, signature, given: code(builder, given[0])
 
-    return types.int32(types.float32), codegen
+    return function
 
 
-@intrinsic
-def float_of(context: Any, bits: Any) -> Any:
-    """The float32 that has these bits, int32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), codegen
+# The bits of a float32 as int32, and back.
+bits_of = unary(types.int32, types.float32, lambda builder, x: builder.bitcast(x, ir.IntType(32)))
+float_of = unary(types.float32, types.int32, lambda builder, x: builder.bitcast(x, ir.FloatType()))
 
 
 @kernel
 def tanh(x):
     """Hyperbolic tangent, to 2e-7.
 
-    tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction cut off
-    after its seventh term: an error of 1e-8, and rounding, by which the result can exceed 1. From
-    x = 9.2 on all is 1.
+    tanh 2y = 2t / (1 + t²) with t = tanh y ≈ y p(y²) / q(y²), Lambert's continued fraction to its
+    seventh term. Its error is 1e-8; rounding can make the result exceed 1. From x = 9.2 on it is 1.
     """
     y = min(max(x * f32(0.5), f32(-4.6)), f32(4.6))
     s = y * y
@@ -79,7 +73,7 @@ ROUNDING = f32(1.5 * 2**23)  # added to a small number, it leaves no digits afte
 def exp(x):
     """eˣ, to 1 unit in the last place; Inf above 88.72, 0 below -103.97.
 
-    eˣ = 2ⁿ eʳ with n the nearest integer to x / ln 2, and |r| ≤ ln 2 / 2, where a polynomial does
+    eˣ = 2ⁿ eʳ with n the nearest integer to x / ln 2, and a polynomial for |r| ≤ ln 2 / 2
     (coefficients: Cephes, expf).
     """
     x = min(max(x, f32(-105)), f32(90))
@@ -98,10 +92,8 @@ def exp(x):
 
 @kernel
 def log(x):
-    """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf.
-
-    x = 2ⁿ m with m between √½ and √2, where a polynomial does (coefficients: Cephes, logf).
-    """
+    """Natural logarithm of a normal positive number, to 1 unit in the last place; Inf of Inf."""
+    # x = 2ⁿ m, and a polynomial for m between √½ and √2 (coefficients: Cephes, logf).
     bits = bits_of(x) - np.int32(0x3F3504F3)  # of √½
     n = f32(bits >> np.int32(23))
     f = float_of((bits & np.int32(0x007FFFFF)) + np.int32(0x3F3504F3)) - f32(1)

@@ -8,22 +8,19 @@ import numpy as np
 from mace_rl.numerics.compiling import njit
 from mace_rl.refusal import Refusal
 
-# Of a reward, or of a number in an observation. Networks learn in float32: its 7 digits lose an
-# ordinary reward beside a larger one, and sums of larger squares are infinite.
+# For rewards and numbers in observations: float32 loses ordinary rewards beside larger ones, and
+# sums of larger squares overflow.
 TOO_LARGE = 1e12
 
 
 class NonFiniteError(Refusal, ArithmeticError):
-    """NaN, Inf or a number out of its range; the message says in what, and where in the run."""
+    """NaN, Inf or a number out of its range; the message says of what, and where in the run."""
 
 
 def require_finite(
     name: str, values: float | np.ndarray, where: str = "", too_large: float = math.inf
 ) -> None:
-    """Raise `NonFiniteError` if `values` has a NaN or what is not within ±`too_large`.
-
-    `where` follows the number in the message.
-    """
+    """`NonFiniteError`, with `where` after the number, unless all |values| < `too_large`."""
     good = abs(values) < too_large if isinstance(values, float) else all_below(values, too_large)
     if not good:
         found = np.asarray(values)
@@ -44,10 +41,7 @@ def numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 def require_within(
     name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
 ) -> None:
-    """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`].
-
-    They may be outside by so much `rounding`.
-    """
+    """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`] ± `rounding`."""
     require_finite(name, values)
     found = np.asarray(values)
     outside = found[(found < -rounding) | (found > largest + rounding)].ravel()
@@ -57,7 +51,7 @@ def require_within(
 
 @njit(cache=True)
 def all_below(values: np.ndarray, bound: float) -> bool:
-    """Whether an array of any shape has neither a NaN nor what is not within ±`bound`."""
+    """Whether all numbers of an array of any shape are within ±`bound`; NaN is not."""
     good = True
     for value in values.flat:
         good &= abs(value) < bound

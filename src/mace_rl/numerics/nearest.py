@@ -1,10 +1,8 @@
 """Exact nearest neighbours among a few thousand points, by brute force in compiled code.
 
-Trees lose in this setting: the points change every few episodes, so a tree serves a few hundred
-queries, and in Hopper's 15 dimensions it prunes next to nothing. What takes time beside distances
-is to select the nearest. The points are dealt into 64 groups, and while distances are computed the
-nearest of each group is kept. As far as the k-th nearest of these are at least k points, and few
-more: few points have to be looked at again.
+Trees are slower here: the points change every few episodes, and in Hopper's 15 dimensions a tree
+prunes next to nothing. The points are dealt into 64 groups. The k-th smallest of the groups' least
+distances bounds the distance of the k nearest points, and few others are within it.
 """
 
 from typing import Any
@@ -15,7 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.elementary import bits_of, float_of
+from mace_rl.numerics.elementary import bits_of, float_of, unary
 from mace_rl.numerics.products import LANES, VECTOR, address, everywhere, fused
 
 VECTORS = 4
@@ -25,11 +23,10 @@ FAR = 1e18  # what fills up the last block
 
 
 class Neighbours:
-    """Points among which the nearest are searched for: laid out once, then asked for one or many.
+    """An index of points, to search for their nearest neighbours.
 
     points: float32 [M, size], finite; mean, std: [size]. Distances are Euclidean between
-    (x - mean) / std of query and point. `mean` cancels but for rounding, which is least if it is
-    near the points.
+    (x - mean) / std of query and point. A `mean` near the points keeps rounding errors small.
     """
 
     def __init__(self, points: np.ndarray, mean: np.ndarray, std: np.ndarray) -> None:
@@ -44,7 +41,7 @@ class Neighbours:
         """The `count` ≤ M nearest points to each query, nearest first, in units of `std`.
 
         queries: float32 [N, size]. Returns squared distances, float32 [N, count], and the points'
-        indices, int64 [N, count]; of equally distant points the first come first.
+        indices, int64 [N, count]. Equally distant points come in their own order.
         """
         if not 0 < count <= len(self):
             raise ValueError(f"{count} neighbours of {len(self)} points")
@@ -53,7 +50,7 @@ class Neighbours:
 
 @kernel
 def aligned_buffer(count):
-    """So many floats at the beginning of a cache line: a vector that straddles two takes longer."""
+    """`count` floats from the beginning of a cache line, where vectors load fastest."""
     memory = np.empty(count + LANES, np.float32)
     first = -memory.ctypes.data % (4 * LANES) // 4
     return memory[first : first + count]
@@ -77,10 +74,9 @@ def in_blocks(points, mean, std):
 def measure(
     context: Any, blocks: Any, count: Any, query: Any, size: Any, distances: Any, least: Any
 ) -> Any:
-    """Fill in the squared distances of a query to all points of so many blocks, and the least.
+    """Fill in the squared distances of a query to all points of `count` blocks, and the least.
 
-    Sums over the dimensions in order, by fused multiply-adds. blocks, query, distances, and least,
-    of the points at the same place in each block, [64]: addresses.
+    All but count and size are addresses; `least` is [64], over the same place in each block.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -139,7 +135,7 @@ def measure(
 
 @intrinsic
 def within(context: Any, distances: Any, bound: Any) -> Any:
-    """Which of 64 distances, at this address, are within `bound`, a bit each; NaN always is."""
+    """A bit for each of the 64 distances at this address: whether it is ≤ `bound` or NaN."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.VectorType(ir.FloatType(), BLOCK)
@@ -152,7 +148,7 @@ def within(context: Any, distances: Any, bound: Any) -> Any:
 
 @intrinsic
 def smaller(context: Any, numbers: Any, number: Any) -> Any:
-    """Which of 32 int64, at this address, are smaller than `number`, a bit each."""
+    """A bit for each of the 32 int64 at this address: whether it is smaller than `number`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.VectorType(ir.IntType(64), RANKED)
@@ -164,28 +160,13 @@ def smaller(context: Any, numbers: Any, number: Any) -> Any:
     return types.uint64(types.intp, types.int64), codegen
 
 
-@intrinsic
-def lowest(context: Any, bits: Any) -> Any:
-    """The place of the lowest bit that is set; 64 if there is none."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.IntType(1)(0))
-
-    return types.int64(types.uint64), codegen
+# The place of the lowest bit that is set, 64 if none is; and the number of bits that are set.
+lowest = unary(types.int64, types.uint64, lambda builder, x: builder.cttz(x, ir.IntType(1)(0)))
+how_many = unary(types.int64, types.uint64, lambda builder, x: builder.ctpop(x))
 
 
-@intrinsic
-def how_many(context: Any, bits: Any) -> Any:
-    """The number of bits that are set."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.uint64), codegen
-
-
-# A point near a query is one number: the bits of its squared distance, which order as distances do,
-# then its place. So the nearest are the smallest, and of equally distant ones the first.
+# A point is one number: the bits of its squared distance, which sort as it does, then its place. So
+# the nearest are the smallest numbers, and of equally distant ones the first.
 PLACE = 2**32 - 1
 INFINITE = np.int32(0x7F800000)  # the bits of float32's Inf
 ALWAYS_WRITTEN = 4  # points of a block that are written down whether they are near or not
@@ -218,8 +199,7 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
             bits = within(place + 4 * BLOCK * b, bound)
             if b == block_count - 1:
                 bits &= ~np.uint64(0) >> np.uint64(block_count * BLOCK - total)
-            # Most blocks have none to three, which no processor can foresee: to write down a few
-            # too many, which the next block overwrites, takes less time than to ask.
+            # Always writing four, and overwriting what is too many, is faster than a branch.
             end = found + how_many(bits)
             for k in range(ALWAYS_WRITTEN):
                 m = BLOCK * b + lowest(bits)
@@ -243,14 +223,11 @@ def nearest_in_blocks(queries, blocks, mean, std, total, count):
 
 @kernel
 def distance_bound(least, count):
-    """As far as at least `count` of 64 distances, in few steps: one that is hardly too large.
-
-    It halves the bits of a float32, 2¹⁷ of which are a difference of 1.6 %. Inf if there are fewer.
-    """
+    """A bound for at least `count` of 64 distances, up to 1.6 % too large; Inf if `count` > 64."""
     low, high = np.int32(0), INFINITE
     if count > BLOCK:
         return float_of(high)
-    while high - low > 2**17:
+    while high - low > 2**17:  # of a float32's bits
         middle = np.int32((low + high) // 2)
         if how_many(within(address(least), float_of(middle))) < count:
             low = middle
@@ -261,11 +238,7 @@ def distance_bound(least, count):
 
 @kernel
 def sort(numbers, found, ranked):
-    """Sort the first `found` of different numbers into `ranked`; both are as long.
-
-    One's rank is how many are smaller. There is nothing in this that a processor would have to
-    guess, and it compares many at a time.
-    """
+    """Sort the first `found` of different numbers into `ranked`, by how many are smaller."""
     for k in range(found, found + RANKED):
         numbers[k] = LARGEST
     for k in range(found):

@@ -1,15 +1,17 @@
 """Networks: one small interface, and two implementations.
 
 A `torch.nn.Module` defines each network. `TorchNetwork` runs any such module; `CompiledMLP` runs
-the default one, a tanh network, in compiled code. Whoever holds a network sees a flat vector of
-parameters and outputs, and cannot tell which it is.
+the default one, a tanh network, in compiled code.
 """
 
+import math
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from torch.nn.utils import skip_init
 
 from mace_rl.numerics import network_kernels as kernels
 from mace_rl.numerics.products import padded
@@ -34,7 +36,7 @@ class Network(Protocol):
 
 
 class TorchNetwork:
-    """Any torch module; its parameters become views of the flat vector."""
+    """A `Network` of any torch module, whose parameters become views of the flat vector."""
 
     def __init__(self, module: torch.nn.Module) -> None:
         self._module = module
@@ -43,22 +45,18 @@ class TorchNetwork:
 
     @torch.no_grad()
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
         return self._module(torch.from_numpy(np.array(inputs, np.float32))).numpy()
 
     def move_to(self, memory: np.ndarray) -> None:
-        """See `Network`."""
         vector = torch.from_numpy(memory)
         vector.copy_(torch.nn.utils.parameters_to_vector(self._module.parameters()).detach())
         torch.nn.utils.vector_to_parameters(vector, self._module.parameters())  # as views
         self.parameters = memory
 
     def module(self) -> torch.nn.Module:
-        """See `Network`."""
         return self._module
 
     def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
-        """See `Network`."""
         self._module.load_state_dict(state)
 
 
@@ -70,10 +68,7 @@ class Trace(NamedTuple):
 
 
 class CompiledMLP:
-    """The tanh network of `mlp` in compiled code.
-
-    `parameters` are laid out as in `network_kernels`, with zeros between them.
-    """
+    """A `Network` of `mlp` in compiled code; `network_kernels` has the layout of `parameters`."""
 
     def __init__(self, module: torch.nn.Sequential) -> None:
         shapes = [layer.weight.shape for layer in module if isinstance(layer, torch.nn.Linear)]
@@ -83,11 +78,10 @@ class CompiledMLP:
         self.load_module_state(module.state_dict())
 
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        """See `Network`."""
         return self.forward(inputs).outputs
 
     def forward(self, inputs: np.ndarray) -> Trace:
-        """Outputs for inputs, [N, in] → `Trace` with [N, out]."""
+        """`outputs`, and what `backward` needs of the way to them."""
         inputs = np.ascontiguousarray(inputs, np.float32)
         outputs, activations = kernels.network_outputs(inputs, self.parameters, self.sizes)
         return Trace(outputs, (inputs, activations))
@@ -125,17 +119,9 @@ class CompiledMLP:
         return views
 
     def module(self) -> torch.nn.Sequential:
-        """See `Network`."""
-        module = tanh_layers(self.sizes.tolist())
-        linear = [layer for layer in module if isinstance(layer, torch.nn.Linear)]
-        with torch.no_grad():
-            for layer, (weights, biases) in zip(linear, self.layers(self.parameters), strict=True):
-                layer.weight.copy_(torch.from_numpy(weights.T))
-                layer.bias.copy_(torch.from_numpy(biases))
-        return module
+        return tanh_layers(self.layers(self.parameters))
 
     def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
-        """See `Network`."""
         for place, (weights, biases) in enumerate(self.layers(self.parameters)):
             weights[:] = state[f"{2 * place}.weight"].numpy().T
             biases[:] = state[f"{2 * place}.bias"].numpy()
@@ -148,23 +134,23 @@ def mlp(
 
     Initial weights are orthogonal with gain √2, `output_gain` in the last layer; biases are 0.
     """
-    module = tanh_layers(sizes)
-    linear = [layer for layer in module if isinstance(layer, torch.nn.Linear)]
-    with torch.no_grad():
-        for layer in linear:
-            gain = output_gain if layer is linear[-1] else np.sqrt(2)
-            weights = gain * orthogonal((layer.in_features, layer.out_features), generator)
+    pairs = list(pairwise(sizes))
+    gains = [math.sqrt(2)] * (len(pairs) - 1) + [output_gain]
+    zeros = (np.zeros(outputs) for _, outputs in pairs)
+    weights = (gain * orthogonal(pair, generator) for pair, gain in zip(pairs, gains, strict=True))
+    return tanh_layers(zip(weights, zeros, strict=True))
+
+
+def tanh_layers(parameters: Iterable[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequential:
+    """The torch module of `mlp` from each layer's weights, [in, out], and biases."""
+    layers: list[torch.nn.Module] = []
+    for weights, biases in parameters:
+        # `skip_init`: a new layer would draw weights, from the global generator.
+        layer = skip_init(torch.nn.Linear, *weights.shape, device="cpu", dtype=torch.float32)
+        with torch.no_grad():
             layer.weight.copy_(torch.from_numpy(weights.T))
-            layer.bias.zero_()
-    return module
-
-
-def tanh_layers(sizes: list[int]) -> torch.nn.Sequential:
-    """The layers of `mlp`, with weights that mean nothing."""
-    generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-    linear = [torch.nn.Linear(*pair, device="cpu", dtype=torch.float32) for pair in pairwise(sizes)]
-    torch.set_rng_state(generator)
-    layers = [part for one in linear for part in (one, torch.nn.Tanh())]
+            layer.bias.copy_(torch.from_numpy(biases))
+        layers += [layer, torch.nn.Tanh()]
     return torch.nn.Sequential(*layers[:-1])
 
 

@@ -1,12 +1,11 @@
 """The compiled functions of a tanh network: outputs, and gradients by backpropagation (numba).
 
-Networks of 64 units are too small for a tensor library, whose calls cost more than the work in
-them. All arithmetic is float32, in an order that is written here or in `products` and `elementary`,
-so the bits are the same on every processor, for one state as for many, step by step as in one loop.
+For networks of 64 units the calls of a tensor library cost more than the work in them. All
+arithmetic is float32 in a fixed order: the same bits on every processor, for one state or many.
 
 A network is a flat vector of parameters and its sizes, int64 [layers + 1]. A layer's parameters are
-its weights and, as the last row, its biases, [in + 1, padded out]: products want their columns in
-multiples of 16, so columns of zeros are added. Their gradient is 0, so they stay zeros.
+its weights and, as the last row, its biases, [in + 1, padded out]: columns of zeros are added up to
+a multiple of 16, for `products`. Their gradient is 0, so they stay zeros.
 """
 
 import math
@@ -20,7 +19,7 @@ from mace_rl.numerics.products import Matrix, add_product, address, by_tiles, do
 
 @kernel
 def activation_buffer(count, sizes):
-    """A buffer for what every layer puts out for `count` inputs, flat: [count, padded out] each."""
+    """A buffer for every layer's outputs for `count` inputs, flat: [count, padded out] each."""
     width = 0
     for outs in sizes[1:]:
         width += padded(outs)
@@ -70,11 +69,11 @@ def transposed(parameters, sizes):
 
 @kernel
 def backward(inputs, activations, grad_outputs, back, sizes, gradient, grad_activations):
-    """Add to `gradient`, like the parameters, that of a loss; returns it at the first layer's sums.
+    """Add a loss's gradient to `gradient`, like the parameters; returns that at the first layer.
 
     inputs, activations: of `forward`; grad_outputs: the loss's gradient at the outputs, [N, padded
-    out], with zeros in the columns added; back: the weights `transposed`; grad_activations: like
-    `activations`, overwritten.
+    out], zeros in the columns added; back: the weights `transposed`; grad_activations: like
+    `activations`, overwritten. The first layer's is before its tanh.
     """
     count, ones = len(inputs), np.ones((1, len(inputs)), np.float32)
     end = place = below_end = 0
@@ -119,7 +118,7 @@ def network_outputs(inputs, parameters, sizes):
 
 @kernel
 def network_gradient(inputs, activations, parameters, grad_outputs, sizes):
-    """Gradient, like the parameters, of a loss, and that at the first layer's sums.
+    """A loss's gradient, like the parameters, and what `backward` returns.
 
     activations: of `network_outputs`; grad_outputs: the loss's gradient at the outputs, [N, out].
     """
@@ -132,7 +131,7 @@ def network_gradient(inputs, activations, parameters, grad_outputs, sizes):
 
 @kernel
 def input_gradient(grad_first, parameters, sizes):
-    """A loss's gradient at the inputs, [N, in], from that at the first layer's sums."""
+    """A loss's gradient at the inputs, [N, in], from what `backward` returns."""
     outs, width = sizes[1], padded(sizes[0])
     weights = transposed(parameters, sizes)[: outs * width].reshape(outs, width)
     result = np.empty((len(grad_first), width), np.float32)
@@ -144,8 +143,7 @@ def input_gradient(grad_first, parameters, sizes):
 def orthonormal(matrix):
     """Orthonormal columns that span what the columns of `matrix` do, float64 [M, N], M ≥ N.
 
-    Gram and Schmidt's, each column twice for the sake of rounding. Of a Gaussian matrix it is
-    uniform over all that are possible.
+    By Gram-Schmidt, twice against rounding. Of a Gaussian matrix the result is uniform.
     """
     result = matrix.copy()
     for j in range(result.shape[1]):

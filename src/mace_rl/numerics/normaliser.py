@@ -10,7 +10,7 @@ from mace_rl.state import Stateful
 
 
 class RunningNormaliser(Stateful):
-    """Mean and standard deviation over everything seen so far (Chan et al. 1979), float64.
+    """Mean and standard deviation of all observations so far (Chan et al. 1979), float64.
 
     Before the first `update` the mean is 0 and the standard deviation 1.
     """
@@ -21,8 +21,8 @@ class RunningNormaliser(Stateful):
         self.count = 0
         self.mean = np.zeros(size)
         self.sum_of_squares = np.zeros(size)  # of deviations from the mean
-        self.std = np.ones(size)  # standard deviation; 1 where nothing has varied yet
-        self.varied = np.zeros(size, np.bool_)  # whether each dimension has, beyond rounding
+        self.std = np.ones(size)  # 1 where nothing has varied yet
+        self.varied = np.zeros(size, np.bool_)  # which dimensions have varied beyond rounding
 
     def update(self, observations: np.ndarray) -> None:
         """Take in `observations`, [N, size]."""
@@ -34,27 +34,26 @@ class RunningNormaliser(Stateful):
         return standardised(observations, self.mean, self.std, bound)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
         super().load_state_dict(state)
         spread(self.count, self.sum_of_squares, self.std, self.varied)
 
 
 class Normalisation(NamedTuple):
-    """How one observation is normalised, as it was at some time; float32 [observation] each."""
+    """How observations are normalised at one time."""
 
-    mean: np.ndarray
+    mean: np.ndarray  # float32 [observation], like the next
     inverse_std: np.ndarray
     clip: np.float32  # bound of normalised observations
 
     @classmethod
     def of(cls, mean: np.ndarray, std: np.ndarray, clip: float) -> "Normalisation":
-        """That of a running mean and standard deviation, [observation]."""
+        """From a running mean and standard deviation, [observation]."""
         return cls(mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip))
 
 
 @kernel
 def update(batch, count, mean, sum_of_squares, std, varied):
-    """Take a `batch`, [N, size], into what `count` observations have left; see the class."""
+    """Add a `batch`, [N, size], to the statistics of `count` observations; see the class."""
     share = len(batch) / (count + len(batch))
     for i in range(len(mean)):
         batch_mean = 0.0
@@ -71,7 +70,7 @@ def update(batch, count, mean, sum_of_squares, std, varied):
 
 @kernel
 def spread(count, sum_of_squares, std, varied):
-    """Fill in the standard deviation, and where there is one."""
+    """Fill in the standard deviation, and which dimensions have varied."""
     for i in range(len(std)):
         deviation = math.sqrt(sum_of_squares[i] / max(count, 1))
         varied[i] = deviation > 1e-8
@@ -80,11 +79,11 @@ def spread(count, sum_of_squares, std, varied):
 
 @kernel
 def standardised(observations, mean, std, bound):
-    """`normalise` of each row, float32 [N, size], as acting does it with the same mean and std."""
+    """`normalise` of each row, to the bit, float32 [N, size]."""
     result = np.empty(observations.shape, np.float32)
     centre, inverse = mean.astype(np.float32), (1 / std).astype(np.float32)
     clip = np.float32(bound)
-    for n in range(len(observations)):  # written out: a call for each row takes ten times as long
+    for n in range(len(observations)):  # a call for each row takes ten times as long
         for i in range(len(centre)):
             value = (observations[n, i] - centre[i]) * inverse[i]
             result[n, i] = min(max(value, -clip), clip)
@@ -93,7 +92,7 @@ def standardised(observations, mean, std, bound):
 
 @kernel
 def normalise(observation, normalisation, result):
-    """Fill in, and return, (observation - mean) / std, clipped to ±clip; float32 [size]."""
+    """Fill in and return (observation - mean) / std, clipped to ±clip; float32 [size]."""
     mean, inverse_std, clip = normalisation
     for i in range(len(observation)):
         result[i] = min(max((observation[i] - mean[i]) * inverse_std[i], -clip), clip)

@@ -4,14 +4,12 @@ Every element of a product is one chain of fused multiply-adds over k, in order:
 
     C[i, j] = fma(A[i, K-1], B[K-1, j], … fma(A[i, 1], B[1, j], fma(A[i, 0], B[0, j], start[i, j])))
 
-A fused multiply-add rounds once, and IEEE 754 says how, so it does not matter how many elements a
-processor computes at once, nor in which order. It also does not matter where a chain is cut: what
-came out so far is the next part's start. Libraries split the chains to gain speed, each processor's
-kernel in another way, which is why their last bits differ.
+A fused multiply-add rounds once, as IEEE 754 says. So it does not matter how many elements a
+processor computes at once, nor where a chain is cut and continued. Libraries split the chains,
+differently on each processor, so their last bits differ.
 
-A *tile* is a block of C that stays in the processor's registers while k runs. It is LLVM's code
-with vectors of 16 floats: one register of AVX-512 or two of AVX2, as LLVM sees fit. For each k it
-loads a row of B once, whatever the number of rows of A.
+A *tile* is a block of C that stays in registers while k runs: LLVM code with vectors of 16 floats,
+one register of AVX-512 or two of AVX2.
 """
 
 from typing import Any, NamedTuple
@@ -47,18 +45,15 @@ def everywhere(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> i
 
 
 class Matrix(NamedTuple):
-    """A float32 matrix in memory: its address, and how many elements on the next ones begin."""
+    """A float32 matrix in memory: its address, and its strides in elements."""
 
     address: int
     row: int
-    column: int  # 1 in B, C and what C starts from
+    column: int  # 1 in B, C and `start`
 
 
 def tile(rows: int, vectors: int) -> Any:
-    """The compiled tile of `rows` × 16 `vectors`: C = start + Σ_k A[i, k] B[k, j].
-
-    Its arguments are four `Matrix`, where in C it begins (row and column), and K.
-    """
+    """The compiled tile of `rows` × 16 `vectors`: C = start + Σ_k A[i, k] B[k, j], k < count."""
 
     @intrinsic
     def multiply(context, a, b, start, c, first_row, first_column, count):
@@ -123,10 +118,9 @@ def tile(rows: int, vectors: int) -> Any:
     return multiply
 
 
-# Eight chains have to be under way for a processor to be busy: each of its two units starts one a
-# cycle and has the result four cycles later. With the 32 registers of AVX-512, 4 × 64 keeps sixteen
-# in C and loads little; with AVX2's 16 of half the size, 6 × 16 fills twelve. What is left over, a
-# row or a stripe of 16 columns, has tiles of its own.
+# Eight chains keep a processor busy: each of its two units starts one a cycle and has the result
+# four cycles later. A tile of 4 × 64 keeps 16 of AVX-512's 32 registers in C; 6 × 16 fills 12 of
+# AVX2's 16, which are half as large. Rows and stripes of 16 columns left over have their own tiles.
 broad, broad_pair, broad_row, long_row = tile(4, 4), tile(2, 4), tile(1, 4), tile(1, 16)
 slim, slim_row = tile(8 if WIDE else 6, 1), tile(1, 1)
 SLIM_ROWS = 8 if WIDE else 6
@@ -134,7 +128,7 @@ SLIM_ROWS = 8 if WIDE else 6
 
 @njit(cache=True)
 def address(array):
-    """Where its elements begin, as int64: compiled code then has one kind of addresses."""
+    """Where its elements begin, as int64."""
     return np.int64(array.ctypes.data)
 
 
@@ -186,13 +180,13 @@ def product(a, b, start, c):
 
 @njit(cache=True)
 def add_product(a, b, c):
-    """C = C + A · B: every chain goes on from what C has; arguments as in `product`."""
+    """C = C + A · B: every chain continues from C; arguments as in `product`."""
     by_tiles(matrix(a), matrix(b), matrix(c), matrix(c), len(c), c.shape[1], len(b))
 
 
 @njit(cache=True)
 def padded(columns):
-    """The multiple of 16 that `columns` are filled up to."""
+    """`columns` rounded up to a multiple of 16."""
     return (columns + LANES - 1) // LANES * LANES
 
 

@@ -1,4 +1,4 @@
-"""Trained agents as ordinary torch modules.
+"""Trained agents as torch modules, and playing with them.
 
 policy = load_agent("results/runs/CartPole-v1/ppo/seed0").policy
 action = policy(observation).sample()
@@ -18,7 +18,7 @@ from mace_rl import files
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig
 from mace_rl.factories import actor_critic, environment
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
@@ -35,19 +35,17 @@ class PolicyModule(TorchPolicy):
     clip: Tensor
 
     def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
-        """space: that of what the environment gives."""
+        """space: of the environment's observations."""
         super().__init__(networks.policy)
         self.space = space
-        mean, std, clip = networks.normalisation()
-        self.register_buffer("mean", torch.from_numpy(mean.copy()))
-        self.register_buffer("std", torch.from_numpy(std.copy()))
-        self.register_buffer("clip", torch.from_numpy(np.array(clip)))
+        for name, value in zip(("mean", "std", "clip"), networks.normalisation(), strict=True):
+            self.register_buffer(name, torch.from_numpy(np.array(value)))
 
     def forward(self, observations: Any) -> Distribution:
         """The distribution over actions in each state; observations: one, or a batch of them.
 
         Discrete actions count from 0; the others are not clipped to their bounds. Raises
-        `ObservationError` for what is no observation.
+        `ObservationError` for other inputs.
         """
         rows = encoded(observations, self.space, len(self.mean)).to(self.mean.device)
         seen = ((rows - self.mean) / self.std).clip(-self.clip, self.clip).float()
@@ -55,7 +53,7 @@ class PolicyModule(TorchPolicy):
 
 
 class Agent(torch.nn.Module):
-    """The policy and the critics, whose inputs are observations normalised as the policy's."""
+    """The policy, and the critics, which take normalised observations."""
 
     def __init__(self, networks: ActorCritic, space: Space[Any]) -> None:
         super().__init__()
@@ -66,10 +64,9 @@ class Agent(torch.nn.Module):
 
 @dataclass(frozen=True)
 class MostProbable(NetworkActing):
-    """Acting without chance: the most probable action, the first of several; the mean of a Box."""
+    """Acts without sampling: the first most probable action, or the mean of a Gaussian."""
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        """See `ActingPolicy`; the noise does not matter."""
         outputs = self.outputs(observation)
         action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]
         return action, self.policy.log_probs(outputs, np.array([action]))[0]
@@ -78,17 +75,17 @@ class MostProbable(NetworkActing):
 def load_agent(directory: str | Path, trust: bool = False) -> Agent:
     """The agent of the finished run in `directory`.
 
-    Nothing in the files is executed, and of the code that they name only this package's unless
-    `trust`: `ConfigError`. Raises `CheckpointError` if `agent.pt` has something else than weights
-    of such an agent, and what the parts of a `FinishedRun` raise.
+    Nothing in the files is executed. `ConfigError` if they name code from outside this package,
+    unless `trust`. Raises `CheckpointError` if `agent.pt` is not of such an agent, and what the
+    parts of a `FinishedRun` raise.
     """
     return Player.of(FinishedRun(directory, trust)).agent
 
 
 class Player:
-    """The environment of a run and its agent, without what trains that; untrained at first."""
+    """The environment of a run and its agent, untrained at first, without a trainer."""
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: AgentConfig) -> None:
         streams = Streams(config.seed)
         self.environment = environment(config, streams)
         self.networks = actor_critic(config, self.environment, config.bonus is not None, streams)
@@ -96,8 +93,8 @@ class Player:
 
     @classmethod
     def of(cls, run: FinishedRun) -> "Player":
-        """With the agent that came of `run`; raises what `load_agent` raises."""
-        player = cls(run.config)
+        """With the trained agent of `run`; raises what `load_agent` raises."""
+        player = cls(run.agent_config)
         player._load(run.agent_state, run.folder / files.AGENT)
         return player
 
@@ -118,7 +115,7 @@ class Player:
             policy.log_std[:] = loaded.log_std.detach().numpy()
 
     def acting(self, deterministic: bool) -> ActingPolicy:
-        """Its policy for rollouts: it samples its actions, or takes the most probable ones."""
+        """The policy for rollouts, which samples actions, or takes the most probable ones."""
         policy, module = self.networks.policy, self.agent.policy
         mean, std, clip = module.mean.numpy(), module.std.numpy(), float(module.clip)
         normalisation = Normalisation.of(mean, std, clip)
@@ -128,7 +125,7 @@ class Player:
 
 
 def _kind(entry: Any) -> str:
-    """What an entry of a state is, without its values."""
+    """The type and shape of an entry of a state, for messages."""
     if isinstance(entry, Tensor):
         return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
     return "missing" if entry is None else f"a {type(entry).__name__}"

@@ -1,7 +1,7 @@
 """Checkpoints and agents on disk: written atomically, read without executing anything.
 
-A checkpoint is `sha256 of the rest, newline, torch archive`. It carries the identity of the run
-it belongs to (configuration, code, versions); one of another identity is never continued.
+A checkpoint is `sha256 of the rest, newline, torch archive`. It has the identity of its run
+(configuration, code, versions), and no other run continues it.
 """
 
 import hashlib
@@ -27,19 +27,16 @@ class CheckpointError(Refusal, ValueError):
 
 
 def archive(content: dict[str, Any]) -> bytes:
-    """`content` (tensors, numbers, strings, lists, dicts) as a torch archive.
-
-    Equal content gives equal bytes.
-    """
+    """Tensors, numbers, strings, lists and dicts as a torch archive; equal content, equal bytes."""
     buffer = io.BytesIO()
     torch.save(_unshared(content), buffer)
     return buffer.getvalue()
 
 
 def _unshared(content: Any) -> Any:
-    """The same with one object for equal strings, and one each for equal lists and dictionaries.
+    """The same with one object for equal strings, and different ones for lists and dictionaries.
 
-    Pickle writes an object that comes again as a reference, an equal one in full.
+    Pickle writes the same object again as a reference, but an equal one in full.
     """
     kind = type(content)
     if kind is dict:
@@ -50,23 +47,20 @@ def _unshared(content: Any) -> Any:
 
 
 def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
-    """Read back what `archive` wrote; nothing but plain data is accepted (`weights_only`).
-
-    It is not larger in memory than on disk: torch does not compress.
-    """
+    """Read what `archive` wrote; only plain data, not compressed, is accepted (`weights_only`)."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as members:
             if sum(member.file_size for member in members.infolist()) > len(data):
                 raise ValueError("it is compressed")
         return dict(torch.load(io.BytesIO(data), weights_only=True))
-    except Exception as error:  # torch reports damage by many types
-        # Of PyTorch's advice to trust it, with colours, not more than the first sentence.
+    except Exception as error:  # torch raises many types
+        # The first sentence: PyTorch goes on with advice to trust the file, in colours.
         reason = str(error).splitlines()[0].partition(". ")[0] if str(error) else repr(error)
         raise CheckpointError(f"{origin}: not a readable archive: {reason}") from error
 
 
 def require_plain(value: Any, place: str) -> None:
-    """`CheckpointError` that names the `place` of what `unarchive` would not read again."""
+    """`CheckpointError`, with the `place`, if `unarchive` would not read `value`."""
     if type(value) not in PLAIN:
         right = "a tensor, number, text, list or dict, to be read without executing anything"
         raise CheckpointError(f"{place} is {short_repr(value)}, but should be {right}")
@@ -84,7 +78,7 @@ def save(path: Path, identity: dict[str, Any], state: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """`identity` and `state` of a checkpoint, whosever; `CheckpointError` if it is damaged."""
+    """`identity` and `state` of any run's checkpoint; `CheckpointError` if it is damaged."""
     digest, _, data = path.read_bytes().partition(b"\n")
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")

@@ -15,8 +15,8 @@ def evaluate(
 ) -> np.ndarray:
     """Undiscounted extrinsic returns, [episodes], of the agent in `directory`.
 
-    It acts as it did in training, by sampling, or if `deterministic` by its most probable actions.
-    Environment and actions draw from `seed`: the environment the same either way.
+    It samples actions as in training, or takes the most probable ones if `deterministic`. Both the
+    environment and the actions draw from `seed`, so the environment draws the same either way.
     """
     player = Player.of(FinishedRun(directory, trust))
     environment, policy = player.environment, player.acting(deterministic)

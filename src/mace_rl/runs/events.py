@@ -1,8 +1,4 @@
-"""What runs recorded as TensorBoard's events, for whoever compares runs there.
-
-They are made from a run's records whenever they are asked for, so that training neither depends on
-it nor changes by it. The package tensorboardX writes the files; only TensorBoard shows them.
-"""
+"""The records of runs as event files for TensorBoard."""
 
 import tempfile
 from collections.abc import Mapping
@@ -22,8 +18,7 @@ from mace_rl.runs.finished import FinishedRun
 def write_all(folder: Path, out: Path) -> int:
     """Write the events of every run in and below `folder` to the same places below `out`.
 
-    Returns how many runs there are. Raises `RecordError` if there are none, or for damaged records,
-    and `Refusal` without tensorboardX.
+    Returns their number. `RecordError` for none or damaged ones, `Refusal` without tensorboardX.
     """
     runs = files.runs_below(folder, [files.RECORD, files.CHECKPOINT])
     if not runs:
@@ -34,10 +29,7 @@ def write_all(folder: Path, out: Path) -> int:
 
 
 def write(run: Path, out: Path) -> None:
-    """Write the events of one run to `out`, in place of earlier ones; equal records, equal bytes.
-
-    Records have no clock, so that every wall time is 0; steps are episodes.
-    """
+    """Write the events of one run to `out`, over earlier ones; equal records, equal bytes."""
     try:
         from tensorboardX import RecordWriter
         from tensorboardX.proto.event_pb2 import Event
@@ -60,10 +52,7 @@ def write(run: Path, out: Path) -> None:
 
 
 def read(run: Path) -> dict[str, pd.DataFrame]:
-    """The tables of a run by the prefix of their tags: its files, or what its checkpoint has.
-
-    Raises `CheckpointError` for a damaged checkpoint, and what the parts of a `FinishedRun` raise.
-    """
+    """The tables of a run, from its files or its checkpoint, by the prefix of their tags."""
     if (run / files.RECORD).exists():
         finished = FinishedRun(run)
         tables = {"episodes": finished.episodes, "updates": finished.diagnostics}
@@ -76,10 +65,10 @@ def read(run: Path) -> dict[str, pd.DataFrame]:
 
 
 def rows(tables: Mapping[str, pd.DataFrame]) -> list[tuple[int, dict[str, float]]]:
-    """Each row's episode and its values by tag but for NaN, in the order of the episodes."""
+    """Each row's episode and its values by tag, without NaN, in the order of episodes."""
     found: list[Any] = []
     for prefix, table in tables.items():
         values = table.set_index("episode").drop(columns="update", errors="ignore")
-        for episode, row in values.add_prefix(f"{prefix}/").iterrows():
-            found.append((episode, row.dropna().to_dict()))
+        tagged = values.add_prefix(f"{prefix}/").iterrows()
+        found += [(episode, row.dropna().to_dict()) for episode, row in tagged]
     return sorted(found, key=lambda row: row[0])  # stable: episodes before their update

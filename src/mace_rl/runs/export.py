@@ -1,4 +1,4 @@
-"""Finished runs as one tidy table, a row per episode, for other people's tools."""
+"""Finished runs as one tidy table, a row per episode, for other tools."""
 
 from pathlib import Path
 from typing import Any
@@ -11,19 +11,14 @@ from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
 
 RUN = ("task", "algorithm", "seed")  # environment, variant, seed
-EPISODE = {  # our name of each other column; the step counts all of the run, this episode included
-    "step": "env_steps",
-    "return": "extrinsic_return",
-    "episode": "episode",
-    "length": "length",
-    "beta": "beta",
-}
+EPISODE = {"step": "env_steps", "return": "extrinsic_return"}  # our names of the other columns
+EPISODE |= {name: name for name in ("episode", "length", "beta")}
 
 
 def columns(folder: Path) -> dict[str, list[Any]]:
     """The table of every finished run in and below `folder`.
 
-    Raises `RecordError` if there are none, or two of the same name, or for damaged records.
+    Raises `RecordError` if there are none, two are of the same name, or records are damaged.
     """
     table: dict[str, list[Any]] = {name: [] for name in (*RUN, *EPISODE)}
     seen: dict[tuple[Any, ...], Path] = {}
@@ -41,7 +36,7 @@ def columns(folder: Path) -> dict[str, list[Any]]:
 
 
 def write(table: dict[str, list[Any]], out: Path) -> None:
-    """Write the table as `out` ends: .csv or .parquet; `Refusal` without pyarrow for the latter."""
+    """Write the table to a .csv or .parquet file; `Refusal` without pyarrow for the latter."""
     header = ",".join(table)
     files.require_ours(out, header.encode() if out.suffix == ".csv" else b"PAR1")
     out.parent.mkdir(parents=True, exist_ok=True)

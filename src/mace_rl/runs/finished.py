@@ -1,4 +1,4 @@
-"""A finished run on disk: what its folder holds, each part checked when it is first asked for."""
+"""A finished run on disk: the parts in its folder, each checked when it is first asked for."""
 
 import csv
 import hashlib
@@ -6,11 +6,11 @@ import io
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl import files
 from mace_rl.config.plugins import code_outside
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
 from mace_rl.runs.provenance import difference, identity, read_record
@@ -18,12 +18,13 @@ from mace_rl.runs.provenance import difference, identity, read_record
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
 
+Config = TypeVar("Config", bound=AgentConfig)
 NEVER_WRITTEN = "not as a training writes it"
 WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
 
 class FinishedRun:
-    """The run that finished in `folder`; whoever asks for a part gets it whole, or a `Refusal`.
+    """The finished run in `folder`: each part is whole, or asking for it raises a `Refusal`.
 
     trust: whether its configuration may name code from outside this package.
     """
@@ -46,12 +47,20 @@ class FinishedRun:
 
     @cached_property
     def config(self) -> RunConfig:
-        """Its configuration, to play or train by; none of the code that it names is imported.
+        """Its configuration, to train by. The code that it names is not imported.
 
-        Raises `ConfigError` if it cannot be used, or names code from outside without `trust`.
+        Raises `ConfigError` if it is wrong, or names code from outside without `trust`.
         """
+        return self._checked(RunConfig)
+
+    @cached_property
+    def agent_config(self) -> AgentConfig:
+        """The same, of what playing needs: other settings may be of another version."""
+        return self._checked(AgentConfig)
+
+    def _checked(self, model: type[Config]) -> Config:
         origin, values = str(self.folder / files.RECORD), self.record["config"]
-        config = check(RunConfig, values, origin)
+        config = check(model, values, origin)
         for key, text in ({} if self.trust else code_outside(values)).items():
             raise ConfigError(
                 f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: "
@@ -60,7 +69,7 @@ class FinishedRun:
         return config
 
     def content(self, name: str) -> bytes:
-        """One of `files.RESULTS`; `RecordError` if it is not the one that `run.json` describes."""
+        """One of `files.RESULTS`; `RecordError` unless its digest is in `run.json`."""
         path = self.folder / name
         content = path.read_bytes() if path.exists() else None
         if content is None or hashlib.sha256(content).hexdigest() != self._digest(name):
@@ -71,7 +80,7 @@ class FinishedRun:
         return str(self.record["outputs"].get(name))
 
     def frame(self, episodes: int) -> "pd.DataFrame":
-        """`episodes.csv` with so many rows (`read_episodes`); `RecordError` names a bad line."""
+        """`episodes.csv`, as `read_episodes` reads it."""
         path = self.folder / files.EPISODES
         if not path.exists():
             raise RecordError(f"{path}: {ALTERED}")
@@ -79,7 +88,7 @@ class FinishedRun:
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """`frame` with the episodes that the run is configured to have."""
+        """The same with the configured number of episodes."""
         return self.frame(self.record["config"]["episodes"])
 
     @cached_property
@@ -97,7 +106,7 @@ class FinishedRun:
 
     @cached_property
     def diagnostics(self) -> "pd.DataFrame | None":
-        """`diagnostics.csv`, numbers; a kept run may be without. `RecordError` names the file."""
+        """`diagnostics.csv`, numbers; None in a kept run without. `RecordError` names the file."""
         import pandas as pd
 
         path = self.folder / files.DIAGNOSTICS
@@ -109,7 +118,7 @@ class FinishedRun:
 
     @cached_property
     def agent_state(self) -> dict[str, Any]:
-        """What is in `agent.pt`, plain data; `CheckpointError` if there is anything else."""
+        """The plain data in `agent.pt`; `CheckpointError` if there is anything else."""
         from mace_rl.runs.checkpoint import unarchive
 
         return unarchive(self.content(files.AGENT), self.folder / files.AGENT)
@@ -118,10 +127,10 @@ class FinishedRun:
 def read_runs(
     records: Iterable[str], runs: Iterable[tuple[str, str, int, int]]
 ) -> dict[RunKey, "pd.DataFrame"]:
-    """The episodes of each run.
+    """The episodes of each run; raises what `FinishedRun.frame` raises.
 
-    records: their `run.json`s, each beside its `episodes.csv`; runs: for each its environment,
-    variant, seed and number of episodes. Raises what `FinishedRun.frame` raises.
+    records: the paths of their `run.json`; runs: their environment, variant, seed and number of
+    episodes.
     """
     return {
         (environment, variant, seed): FinishedRun(Path(record).parent).frame(episodes)
@@ -130,14 +139,13 @@ def read_runs(
 
 
 def finished(config: RunConfig, directory: Path) -> bool:
-    """Whether `directory` holds the results of this run, whole and as it would come out now.
+    """Whether `directory` holds the results of this run by the present code and versions.
 
-    Raises `ConfigError` if they are damaged, of another run, or of other code or versions, as a
-    checkpoint of those is not continued.
+    Raises `ConfigError` if it holds others, or damaged ones.
     """
     if not (directory / files.RECORD).exists():
         return False
-    run = FinishedRun(directory, trust=True)  # nothing of it is run: it is compared
+    run = FinishedRun(directory, trust=True)  # it is only compared
     wanted = identity(config)
     found = {key: run.record[key] for key in wanted} | {"config": run.config.settings()}
     if found != wanted:
@@ -152,7 +160,7 @@ def finished(config: RunConfig, directory: Path) -> bool:
 
 
 def otherwise(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
-    """In words, how the run with the identity `found` differs from the `wanted` one of `config`."""
+    """How the run with the identity `found` differs from the `wanted` one of `config`, in words."""
     code = " or ".join([*config.references().values(), "mace_rl"])
     only_code = found | {"sources": wanted["sources"]} == wanted
     return f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"

@@ -1,4 +1,4 @@
-"""Observations as an environment gives them, one or many, as the vectors that agents train on."""
+"""Observations as an environment gives them, one or many, to the vectors that agents train on."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,16 +14,16 @@ from mace_rl.refusal import Refusal
 
 
 class ObservationError(Refusal, ValueError):
-    """What is no observation of the environment that an agent was trained in."""
+    """Not an observation of the environment that the agent was trained in."""
 
 
 def encoded(given: Any, space: Space[Any], size: int) -> Tensor:
     """Observations of `space`, or vectors as `Spaces.encode` makes them, as float32 [..., size].
 
-    Bounds do not matter: environments exceed them in training, too. Raises `ObservationError`.
+    Bounds are not checked: environments exceed them in training, too. Raises `ObservationError`.
     """
     for read in (_as_given, _flat):
-        # Of what has another form gymnasium, numpy, torch and we ourselves say so.
+        # Gymnasium, numpy, torch and these functions raise for another form.
         with suppress(TypeError, ValueError, LookupError, RuntimeError):
             found = read(given, space)
             if found.shape[-1:] == (size,) and found.numel() and found.isfinite().all():
@@ -36,7 +36,7 @@ def encoded(given: Any, space: Space[Any], size: int) -> Tensor:
 
 
 def _as_given(given: Any, space: Space[Any]) -> Tensor:
-    """From what the environment gives, arrays of it with one more dimension, or a list."""
+    """From an observation, arrays of observations with one more dimension, or a list of them."""
     match space, given:
         case Dict() | Tuple(), [tuple() | Mapping(), *_] if isinstance(given, list):
             return torch.stack([_as_given(one, space) for one in given])
@@ -72,7 +72,7 @@ def _flat(given: Any, space: Space[Any]) -> Tensor:
 
 
 def _are_states(numbers: Tensor) -> bool:
-    """Of a Discrete space: numbers of states, [] or [N], rather than one-hot vectors."""
+    """Whether these are numbers of Discrete states, [] or [N], rather than one-hot vectors."""
     return numbers.ndim < 2 and not numbers.is_floating_point()
 
 

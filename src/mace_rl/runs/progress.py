@@ -1,8 +1,7 @@
 """How far trainings are and when they will be done: `mace-rl train`, and `mace-rl status`.
 
-A run tells now and then how far it is (`mace_rl.runs.run.how_far`). What Snakemake lacks (9.27.1;
-snakemake-logger-plugin-rich 0.5.1 too): it counts jobs, knows nothing of the episodes within them,
-and has no time left, which would have to know that Hopper takes longer than CartPole.
+What Snakemake lacks (9.27.1; snakemake-logger-plugin-rich 0.5.1 too): it counts jobs, not the
+episodes within them, and does not estimate the time left, for which environments differ.
 """
 
 import fcntl
@@ -20,11 +19,11 @@ from mace_rl import files
 from mace_rl.config.section import ConfigError
 
 FILE_SECONDS = 30.0  # between the lines of `line` in a file
-EARLY = 0.1  # the share of its episodes before which a run alone does not say when it ends
+EARLY = 0.1  # the share of its episodes before which a run's own estimate would be a guess
 
 
 def cells(told: Mapping[str, Any]) -> dict[str, str]:
-    """What there is to show of a run that trains, by what it is called."""
+    """The columns for a run that trains; told: by `mace_rl.runs.run.how_far`."""
     early = told["seconds"] - told["start_seconds"] < 1
     return {
         "episode": f"{told['episode']}/{told['episodes']}",
@@ -36,15 +35,12 @@ def cells(told: Mapping[str, Any]) -> dict[str, str]:
 
 
 def own_estimate(told: Mapping[str, Any]) -> float:
-    """Seconds to a run's end by what it tells itself; NaN while that would be a guess.
-
-    Its episodes become longer or shorter as the policy learns.
-    """
+    """Seconds to a run's end from its speed so far; NaN early, when episodes' lengths change."""
     return told["left"] if told["episode"] >= EARLY * told["episodes"] else math.nan
 
 
 def duration(seconds: float) -> str:
-    """`seconds` in words; nothing if they are not known."""
+    """`seconds` in words; "" for NaN."""
     if math.isnan(seconds):
         return ""
     minutes = math.ceil(seconds / 60)
@@ -55,7 +51,7 @@ def duration(seconds: float) -> str:
 
 @contextmanager
 def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Gives the function that shows one run's line, in place or in a file now and then."""
+    """A function that shows a run's progress: in place on a terminal, now and then in a file."""
     in_place = file.isatty()
     before, after, pause = ("\x1b[2K", "\r", 0.0) if in_place else ("", "\n", FILE_SECONDS)
     due = time.monotonic() + pause
@@ -78,7 +74,7 @@ def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
 
 
 def status(results: Path) -> list[str]:
-    """The table of `mace-rl status`, by what the workflow planned in `results` when it began."""
+    """The lines of `mace-rl status`, about the runs that the workflow in `results` planned."""
     try:
         plan = json.loads((results / files.PLAN).read_bytes())
     except FileNotFoundError:
@@ -104,12 +100,12 @@ class Run:
 
     def __init__(self, planned: Mapping[str, Any], results: Path, began: float) -> None:
         self.env, self.variant, self.seed = planned["env"], planned["variant"], planned["seed"]
-        self.work = planned["work"]  # how long it may take, compared with others of its environment
+        self.work = planned["work"]  # relative duration among runs of its environment
         folder = results / "runs" / self.env / self.variant / f"seed{self.seed}"
-        since = began if planned["due"] else 0.0  # what is older is of an earlier attempt
+        since = began if planned["due"] else 0.0  # older files are of an earlier attempt
         record, told = (read(folder / name, since) for name in (files.RECORD, files.PROGRESS))
         self.told = told or {}
-        self.seconds = math.nan  # of the whole training, as far as that is known
+        self.seconds = math.nan  # of the whole training, if known
         if record:
             self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]
         elif held(folder / files.LOCK):
@@ -120,23 +116,21 @@ class Run:
             self.seconds = told["seconds"] - told["start_seconds"] + own_estimate(told)
 
     def left(self, expected: float) -> float:
-        """Seconds to its end: by what it tells, or while that is a guess if it takes `expected`."""
-        if not self.told:
-            return expected
-        known = own_estimate(self.told)
-        spent = self.told["seconds"] - self.told["start_seconds"]
+        """Seconds to its end: its own estimate, or as if it takes `expected` seconds."""
+        known = own_estimate(self.told) if self.told else math.nan
+        spent = self.told["seconds"] - self.told["start_seconds"] if self.told else 0.0
         return expected - spent if math.isnan(known) else known
 
     def row(self) -> dict[str, str]:
-        """What there is to show of it."""
-        blank = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
-        shown = cells(self.told) if self.told else blank | {"episode": "starting"}
+        """Its row in the table."""
+        shown = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
+        shown |= cells(self.told) if self.told else {"episode": "starting"}
         shown |= {"left": "stopped"} if self.state == "stopped" else {}
         return {"environment": self.env, "variant": self.variant, "seed": str(self.seed)} | shown
 
 
 def read(path: Path, since: float) -> Any:
-    """What is in a JSON file that was written `since` then; None if there is none, or not whole."""
+    """A JSON file that was written after `since`; None if there is none, or it is incomplete."""
     try:
         return json.loads(path.read_bytes()) if path.stat().st_mtime >= since else None
     except (FileNotFoundError, json.JSONDecodeError):
@@ -144,7 +138,7 @@ def read(path: Path, since: float) -> Any:
 
 
 def held(lock: Path) -> bool:
-    """Whether a process, on whichever machine, has locked this file."""
+    """Whether a process, on any machine, has locked this file."""
     try:
         with lock.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -156,11 +150,8 @@ def held(lock: Path) -> bool:
 
 
 def seconds_left(runs: Sequence[Run], cores: int) -> tuple[float, list[str]]:
-    """Seconds to the end of the last run, and the environments left out, of which none is known.
-
-    A run is expected to take as long, for its work, as those of its environment that are done or
-    far enough.
-    """
+    """Seconds to the end of the last run, and the environments left out since none is known."""
+    # A run is expected to take as long, for its work, as the known ones of its environment.
     paces: dict[str, list[float]] = {}
     for run in runs:
         if not math.isnan(run.seconds):

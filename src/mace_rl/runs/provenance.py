@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
 from contextlib import suppress
 from pathlib import Path
@@ -20,19 +21,13 @@ from mace_rl.refusal import Refusal
 
 # The packages whose version can change a result.
 PACKAGES = (
-    "torch",
-    "numpy",
-    "scipy",
-    "numba",
-    "llvmlite",
-    "gymnasium",
-    "pybullet",
-    "pybullet-envs-gymnasium",
+    *("torch", "numpy", "scipy", "numba", "llvmlite"),
+    *("gymnasium", "pybullet", "pybullet-envs-gymnasium"),
 )
 
 
 class RecordedConfig(BaseModel):
-    """What every configuration in a run.json has; the rest may be of another version's."""
+    """The keys of every configuration in a run.json, also of other versions."""
 
     environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # cells of the table of `export`
     variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
@@ -41,7 +36,7 @@ class RecordedConfig(BaseModel):
 
 
 class RunRecord(BaseModel):
-    """What every run.json has."""
+    """The keys of every run.json."""
 
     config: RecordedConfig
     versions: dict[str, str]
@@ -51,7 +46,7 @@ class RunRecord(BaseModel):
 
 
 class GitError(Refusal, RuntimeError):
-    """What git cannot do; the message is its reason."""
+    """A failure of git; the message is its reason."""
 
 
 class ProvenanceError(Refusal, ValueError):
@@ -59,7 +54,7 @@ class ProvenanceError(Refusal, ValueError):
 
 
 def identity(config: RunConfig) -> dict[str, Any]:
-    """What two runs have in common that give the same results, and continue each other's."""
+    """Equal identities give equal results, and continue each other's checkpoints."""
     named = config.references().items()
     own = (file for key, name in named for file in source_files(name, key))
     return {
@@ -97,10 +92,7 @@ def versions() -> dict[str, str]:
 
 
 def git_state() -> dict[str, Any]:
-    """Commit of this package's own checkout and whether tracked files differ from it.
-
-    Both None where it is in none, or in somebody else's; "reason" then says why.
-    """
+    """Commit of this package's checkout, and whether tracked files differ; None without one."""
     root = sources.PACKAGE.resolve().parents[1]
     try:
         git(root, "ls-files", "--error-unmatch", "src/mace_rl/runs/provenance.py")
@@ -113,10 +105,7 @@ def git_state() -> dict[str, Any]:
 
 
 def git(root: Path, *arguments: str) -> bytes:
-    """What git prints in the checkout `root`, whatever GIT_DIR and the like say, and who owns it.
-
-    Raises `GitError` with git's reason, also where `root` is only inside a checkout.
-    """
+    """The output of git in the checkout `root`, whoever owns it; `GitError` with git's reason."""
     variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     variables |= {"GIT_CEILING_DIRECTORIES": str(root.parent), "LC_ALL": "C"}
     command = ["git", "-C", str(root), "-c", f"safe.directory={root}"]
@@ -128,21 +117,16 @@ def git(root: Path, *arguments: str) -> bytes:
 
 
 def peak_memory_mb() -> float:
-    """The most resident memory, in MiB, that this process has had.
-
-    Not `ru_maxrss`, which begins at the peak of the process that started this one.
-    """
+    """The peak resident memory of this process, MiB."""
+    # `ru_maxrss` would begin at the peak of the process that started this one.
     status = Path("/proc/self/status").read_text(encoding="ascii")
-    return next(
-        int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM:")
-    )
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
 def cpu_model() -> str:
     """The processor's name as the system gives it."""
-    info = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    names = [line.partition(":")[2].strip() for line in info.splitlines() if "model name" in line]
-    return names[0] if names else platform.machine()
+    found = re.search(r"model name\s*:(.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
+    return found[1].strip() if found else platform.machine()
 
 
 def machine() -> dict[str, Any]:

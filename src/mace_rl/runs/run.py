@@ -1,8 +1,4 @@
-"""Carrying out one run on disk: train, save checkpoints, resume, write the results.
-
-`mace_rl.files` names the files of a run's folder. The same call resumes to the bit from the
-checkpoint that an interrupted one left.
-"""
+"""Carrying out one run on disk: train, save checkpoints, resume to the bit, write the results."""
 
 import fcntl
 import gc
@@ -14,9 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
-import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (numba loads it: before threads are limited)
 import torch
 from threadpoolctl import threadpool_limits
@@ -36,13 +32,12 @@ from mace_rl.trainer import Trainer
 logger = logging.getLogger(__name__)
 
 PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
-START_SHARE = 0.01  # of the episodes, which wait for their code to be compiled
-# A checkpoint follows the last one after this time, or after as long as keeps its cost under 1 %.
+START_SHARE = 0.01  # of the episodes: these wait for their code to be compiled
+# Between checkpoints are this time, and as much as keeps their cost under 1 %.
 CHECKPOINT_SECONDS, CHECKPOINT_VARIABLE = 10.0, "MACE_RL_CHECKPOINT_SECONDS"
 CHECKPOINT_COST = 0.01
-# A training whose Snakemake was killed takes a moment to notice; its successor waits as long.
-LOCK_SECONDS = 5.0
-CLAIM = b"mace-rl trains here\n"  # in the lock's file: a run's files beside it are its own
+LOCK_SECONDS = 5.0  # for which a run waits until one whose Snakemake was killed has ended
+CLAIM = b"mace-rl trains here\n"  # in the lock file: the files of a run beside it are ours
 
 
 class RunError(Refusal, RuntimeError):
@@ -57,23 +52,21 @@ def run(
     after_episode: Callable[[EpisodeRecord], object] | None = None,
     aside: Literal["nothing", "others", "all"] = "nothing",
 ) -> None:
-    """Train as `config` says and leave its results in `directory`.
+    """Train as `config` says, on one thread, and leave the results in `directory`.
 
-    Whoever watches is told `how_far` it is: `observe` if given, else by a file in `directory`; and
-    `after_episode` each episode, when the update that it was played for is done.
+    observe: is told `how_far` the run is, else a file in `directory` is.
+    keep_checkpoint: keep a last one, from which deleted results come back without training.
+    after_episode: is called with each episode after the update on it.
+    aside: what is moved into a folder below `directory`: files of "others" than this run, or "all".
 
-    Continues from its checkpoint if there is one of this very configuration, code and versions,
-    and does nothing where this run is finished. Anything else that is in the way is refused, or
-    moved into a folder below `directory`: "others" than this run, or "all", to start afresh.
-
-    With `keep_checkpoint` a last one stays, from which results that are deleted come back without
-    training. Uses one thread. Raises `RunError` if another process is at work in `directory` or
-    something is in the way, `ConfigError` if a finished run is.
+    Continues from a checkpoint of this configuration, code and versions; does nothing if the run is
+    finished. Raises `RunError` if another process trains in `directory` or other files are in the
+    way, `ConfigError` if another finished run is.
     """
     directory.mkdir(parents=True, exist_ok=True)
     with exclusive(directory) as lock, threadpool_limits(1), single_threaded():
         if aside == "nothing" and finished(config, directory):
-            (directory / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
+            (directory / files.CHECKPOINT).unlink(missing_ok=True)  # of a run killed at its end
             return
         started = time.monotonic()
         identity = provenance.identity(config)
@@ -82,11 +75,11 @@ def run(
         slow = fallback_reason(trainer.environment)
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
-        gc.freeze()  # what is there stays: the collector need not look through it again
+        gc.freeze()  # the collector need not look again at what stays
         clock = Clock(started, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
         if state is not None:
             resume(trainer, clock, state)
-        checkpoint.require_plain(trainer.state_dict(), "state")  # not when it is late
+        checkpoint.require_plain(trainer.state_dict(), "state")  # now rather than after minutes
         told = directory / files.PROGRESS
         observe = observe or (lambda progress: write_atomically(told, json.dumps(progress)))
 
@@ -101,7 +94,8 @@ def run(
                     after_episode(record)
             if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
                 clock.start_seconds = time.monotonic() - started
-            if clock.progress_due():
+            if time.monotonic() >= clock.next_progress:
+                clock.next_progress = time.monotonic() + clock.progress_seconds
                 observe(how_far(trainer, clock))
             if clock.checkpoint_due():
                 save()
@@ -116,10 +110,10 @@ def run(
 def to_continue(
     config: RunConfig, identity: dict[str, Any], directory: Path, lock: int, aside: str
 ) -> dict[str, Any] | None:
-    """The state to continue from; None to start afresh. From then on the folder is a run's.
+    """The state to continue from; None to start afresh. `run` says what happens to other files.
 
-    `lock` is its open lock file, which says so: what nobody knows to be a training's is refused.
-    See `run` for what becomes of anything else. Raises `RunError` for what is refused.
+    `lock`, the folder's open lock file, then claims the folder. Without a claim, files named as a
+    run's may be somebody else's. Raises `RunError` for what is refused.
     """
     path, content = directory / files.CHECKPOINT, None
     trained_here = os.pread(lock, len(CLAIM), 0) == CLAIM
@@ -142,8 +136,8 @@ def to_continue(
         logger.warning("starting afresh: %s; set aside in %s", reason, moved)
         content = None
     if trained_here or path.exists():
-        for name in files.OF_A_RUN:  # half written by a process that was killed
-            for half_written in directory.glob(f".{name}.[0-9]*.tmp"):
+        for name in files.OF_A_RUN:
+            for half_written in directory.glob(f".{name}.[0-9]*.tmp"):  # by a killed process
                 half_written.unlink()
     if not os.fstat(lock).st_size:
         os.write(lock, CLAIM)
@@ -151,14 +145,9 @@ def to_continue(
 
 
 def resume(trainer: Trainer, clock: "Clock", state: dict[str, Any]) -> None:
-    """Continue from the state in a checkpoint.
-
-    An interruption is told by the episode after which the run was continued, the machine that had
-    done the part before, and whether the environment played the last episodes before it again, as
-    it should.
-    """
+    """Continue from the state in a checkpoint, and note the interruption for `run.json`."""
     differs = resuming.replay_differs(trainer.environment, state["trainer"]["last_episodes"])
-    trainer.load_state_dict(state["trainer"])  # also what the replay drew from
+    trainer.load_state_dict(state["trainer"])  # after the replay, which drew random numbers
     logger.info("resuming after episode %d", len(trainer.records))
     if differs:
         logger.warning(
@@ -181,7 +170,7 @@ class Clock:
 
     def __init__(self, start: float, progress_seconds: float) -> None:
         self.start = start  # by `time.monotonic`, as if there had been no interruption
-        self.start_seconds = 0.0  # of this process until its first episodes were over
+        self.start_seconds = 0.0  # from the start of this process to the end of its first episodes
         self.progress_seconds = progress_seconds
         self.next_progress = time.monotonic()
         self.between_checkpoints = between_checkpoints()
@@ -190,7 +179,7 @@ class Clock:
         self.interruptions: list[dict[str, Any]] = []
 
     def account(self) -> dict[str, Any]:
-        """What a checkpoint and `run.json` have of the training's course."""
+        """The entries of a checkpoint and `run.json` about the training's course."""
         return {
             "seconds": self.elapsed(),
             "checkpoint_seconds": self.checkpoint_seconds,
@@ -201,14 +190,6 @@ class Clock:
     def elapsed(self) -> float:
         """Seconds of this run, those before interruptions included."""
         return time.monotonic() - self.start
-
-    def progress_due(self) -> bool:
-        """Whether `progress_seconds` have passed since this last returned True."""
-        now = time.monotonic()
-        if now < self.next_progress:
-            return False
-        self.next_progress = now + self.progress_seconds
-        return True
 
     def checkpoint_due(self) -> bool:
         """Whether it is time for a checkpoint."""
@@ -225,10 +206,10 @@ class Clock:
 
 
 def between_checkpoints() -> float:
-    """Seconds, as MACE_RL_CHECKPOINT_SECONDS says if it is set; `RunError` for what cannot be."""
-    said = os.environ.get(CHECKPOINT_VARIABLE)
+    """Seconds, by MACE_RL_CHECKPOINT_SECONDS if it is set; `RunError` unless it is a number."""
+    said = os.environ.get(CHECKPOINT_VARIABLE, CHECKPOINT_SECONDS)
     try:
-        seconds = CHECKPOINT_SECONDS if said is None else float(said)
+        seconds = float(said)
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds < math.inf:
@@ -238,7 +219,7 @@ def between_checkpoints() -> float:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """PyTorch on one thread as it begins, and nothing frozen for the collector; then as before."""
+    """PyTorch on one thread with its default modes; afterwards as before, and nothing frozen."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -253,10 +234,10 @@ def single_threaded() -> Iterator[None]:
 
 @contextmanager
 def exclusive(directory: Path) -> Iterator[int]:
-    """Hold the run's folder for this process, by a file; the lock goes with the process."""
-    # A file of its own: a folder on a network's disk can be locked by two machines at once.
+    """Lock the run's folder for this process; gives the lock file's descriptor."""
+    # By a file: two machines can lock the same folder on a network's disk.
     with open(directory / files.LOCK, "a+b") as file:
-        # A copy in an environment's worker would hold it when the training has ended.
+        # A copy in an environment's worker would hold the lock after the training.
         os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
         while True:
@@ -272,20 +253,19 @@ def exclusive(directory: Path) -> Iterator[int]:
 
 
 def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
-    """How far it is; `left` are the seconds to its end if its episodes stay as long as the last."""
-    records = trainer.records
-    recent = records[-50:]
-    seconds = clock.elapsed()
-    speed = records[-1].env_steps / max(1e-9, seconds - clock.start_seconds)
-    to_come = trainer.config.episodes - len(records)
+    """A run's progress; `left`, seconds to its end, if episodes stay as long as the last 50."""
+    records, episodes, seconds = trainer.records, trainer.config.episodes, clock.elapsed()
+    last, recent = records[-1], records[-50:]
+    speed = last.env_steps / max(1e-9, seconds - clock.start_seconds)
+    steps_left = (episodes - len(records)) * fmean(record.length for record in recent)
     return {
         "episode": len(records),
-        "episodes": trainer.config.episodes,
-        "recent_return": float(np.mean([record.extrinsic_return for record in recent])),
-        "beta": records[-1].beta,
-        "env_steps": records[-1].env_steps,
+        "episodes": episodes,
+        "recent_return": fmean(record.extrinsic_return for record in recent),
+        "beta": last.beta,
+        "env_steps": last.env_steps,
         "steps_per_second": speed,
-        "left": to_come * float(np.mean([record.length for record in recent])) / speed,
+        "left": steps_left / speed,
         "seconds": seconds,
         "start_seconds": clock.start_seconds,
         "pid": os.getpid(),
@@ -295,12 +275,12 @@ def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
 def write_results(
     directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock
 ) -> None:
-    """Write the records, the agent and, when those are safe, where they come from."""
+    """Write the records, the agent and, last, `run.json`."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
     agent = checkpoint.archive(Agent(trainer.ppo, trainer.environment.given_space).state_dict())
     write_atomically(directory / files.AGENT, agent)
-    origin = identity | {
+    record = identity | {
         "code": provenance.git_state(),
         "threads": torch.get_num_threads(),
         **clock.account(),
@@ -308,6 +288,5 @@ def write_results(
         "peak_memory_mb": provenance.peak_memory_mb(),
         "outputs": {name: provenance.file_digest(directory / name) for name in files.RESULTS},
     }
-    write_atomically(
-        directory / files.RECORD, json.dumps(origin, indent=2, ensure_ascii=False) + "\n"
-    )
+    text = json.dumps(record, indent=2, ensure_ascii=False)
+    write_atomically(directory / files.RECORD, f"{text}\n")

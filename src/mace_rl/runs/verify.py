@@ -1,7 +1,6 @@
-"""Do the runs that this project ships come out again? A sample is repeated and compared to the bit.
+"""Training kept runs again and comparing to the bit.
 
-With the versions that they were made with they have to, on whatever processor.
-With others a last bit may differ, and training amplifies it: a run that differs says in what.
+With the same versions they are equal on every processor; with others a last bit may differ.
 """
 
 import tempfile
@@ -16,11 +15,11 @@ from mace_rl.runs.provenance import difference
 
 
 class NotReproducedError(Refusal):
-    """Repeated runs are not equal to the bit."""
+    """A repeated run is not equal to the bit."""
 
 
 def repeat(then: FinishedRun) -> tuple[bool, str]:
-    """Train as `then` was; whether records and agent are equal, in words."""
+    """Train as `then` was: whether records and agent are equal, and a line about it."""
     from mace_rl.runs.run import run  # PyTorch takes seconds to import
 
     config, before = then.config, then.episodes
@@ -46,10 +45,9 @@ def repeat(then: FinishedRun) -> tuple[bool, str]:
 
 
 def verify(folder: Path, sample: int | None, trust: bool = False) -> Iterator[str]:
-    """Repeat `sample` runs of `folder` (None: all), at random but always the same; yields lines.
+    """Repeat `sample` runs of `folder` (None: all), always the same ones; yields lines.
 
-    Raises `NotReproducedError` if a run is not reproduced, and what the parts of a `FinishedRun`
-    raise.
+    Raises `NotReproducedError` at the end, and what the parts of a `FinishedRun` raise.
     """
     runs = FinishedRun.below(folder, trust)
     if sample is not None and sample < len(runs):

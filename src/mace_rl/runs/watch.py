@@ -18,12 +18,12 @@ from mace_rl.environments.rollout import draw_noise, roll_out
 from mace_rl.runs.agent import Player
 from mace_rl.runs.finished import FinishedRun
 
-# pygame needs neither a screen nor a loudspeaker to draw into memory, and should not look for them.
+# pygame draws into memory: it should not look for a screen or a loudspeaker.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
-MOST_PER_SECOND = 20  # pictures; what an environment has more of is left out, the speed is its own
-LAST_SECONDS = 1.0  # for which the end of an episode stands still
+MOST_PER_SECOND = 20  # pictures; of more some are left out, the speed stays
+LAST_SECONDS = 1.0  # for which an episode's last picture stays
 COLOURS = 48
 LINE_HEIGHT = 18  # pixels, below the picture, for the step and the return so far
 
@@ -38,11 +38,11 @@ class Film:
 
     pictures: list[Image.Image]
     milliseconds: list[int]
-    returns: list[float]  # of whole episodes, whatever was left out of the film
+    returns: list[float]  # of whole episodes, also where the film ends earlier
 
 
 class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment whose episodes are filmed, `seconds` of each at most, `width` pixels wide."""
+    """Films the first `seconds` of each episode of an environment, `width` pixels wide."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, width: int, seconds: float) -> None:
         super().__init__(env)
@@ -53,17 +53,15 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.last_step = seconds * per_second
         self.font = ImageFont.load_default(12)
         self.film = Film([], [], [])
-        self.begun = 0.0  # when the next picture begins; a GIF has hundredths of a second
+        self.begun = 0.0  # when the next picture begins, milliseconds
 
     def reset(self, **arguments: Any) -> Any:
-        """The environment's reset, with the first picture of an episode."""
         result = super().reset(**arguments)
         self.steps, self.extrinsic_return = 0, 0.0
         self._take()
         return result
 
     def step(self, action: Any) -> Any:
-        """The environment's step, with a picture every few and at the end."""
         result = super().step(action)
         _, reward, terminated, truncated, _ = result
         self.steps += 1
@@ -82,7 +80,7 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
             if rendered is None:
                 raise TypeError("render() gives no picture")
             drawn = Image.fromarray(np.asarray(rendered, np.uint8))
-        except Exception as error:  # renderers fail by many types: no display, no library, a bug
+        except Exception as error:  # renderers raise many types
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise RenderError(f"environment {self.name!r} cannot be drawn: {reason}") from error
         height = round(drawn.height * self.width / drawn.width)
@@ -92,6 +90,7 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         ImageDraw.Draw(picture).text((4, height + 2), text, fill="black", font=self.font)
         self.film.pictures.append(picture)
         begun, self.begun = self.begun, self.begun + self.duration
+        # A GIF has hundredths of a second.
         self.film.milliseconds.append(10 * (round(self.begun / 10) - round(begun / 10)))
 
 
@@ -106,30 +105,26 @@ def film(
     width: int = 300,
     seconds: float = 10.0,
 ) -> Film:
-    """The first `episodes` that `evaluate` plays with the agent in `directory`, or `untrained`.
+    """The first `episodes` that `evaluate` plays; untrained: with the agent before training.
 
-    The untrained agent is the same one before training: its initial weights, by the run's seed.
     Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
     run = FinishedRun(directory, trust)
-    config = run.config
+    config = run.agent_config
     player = Player(config) if untrained else Player.of(run)
     environment, policy = player.environment, player.acting(deterministic)
-    # Closed before another is made: pybullet loses the others' simulators when one is forgotten.
+    # Closed before another is made: pybullet loses other simulators when one is collected.
     environment.env.close()
     if "rgb_array" not in (environment.env.metadata.get("render_modes") or []):
         raise RenderError(
             f"environment {config.environment!r} cannot be drawn: 'rgb_array' is not among its"
             " render modes"
         )
+    drawn = {**config.environment_arguments, "render_mode": "rgb_array"}
+    seeds, limit = np.random.SeedSequence(0), config.max_episode_steps
     try:
-        environment = Environment(
-            config.environment,
-            np.random.SeedSequence(0),
-            config.max_episode_steps,
-            {**config.environment_arguments, "render_mode": "rgb_array"},
-        )
-    except ConfigError as error:  # it trains, so it is the mode that it does not take
+        environment = Environment(config.environment, seeds, limit, drawn)
+    except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
@@ -152,13 +147,6 @@ def gif(shown: Film) -> bytes:
     first, *others = (
         picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in shown.pictures
     )
-    file = io.BytesIO()
-    first.save(
-        file,
-        format="GIF",
-        save_all=True,
-        append_images=others,
-        duration=shown.milliseconds,
-        loop=0,
-    )
+    file, times = io.BytesIO(), shown.milliseconds
+    first.save(file, "GIF", save_all=True, append_images=others, duration=times, loop=0)
     return file.getvalue()

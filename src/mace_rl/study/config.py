@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from colorsys import hsv_to_rgb
-from functools import cached_property
+from functools import cached_property, reduce
 from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any
@@ -173,11 +173,8 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
             raise ConfigError(
                 f"{count} variants have the label {label!r}; each should have its own"
             )
-        for pair in study.metrics.comparisons:
-            for variant in pair:
-                check_known(
-                    variant, study.variant_settings, "metrics.comparisons", "variant_settings"
-                )
+        for variant in itertools.chain.from_iterable(study.metrics.comparisons):
+            check_known(variant, study.variant_settings, "metrics.comparisons", "variant_settings")
         known = dict.fromkeys([*study.environments, *study.environment_settings])
         for environment, variant in itertools.product(known, study.variant_settings):
             study.run_config(environment, variant, 0)  # checks its settings
@@ -208,9 +205,7 @@ def read_study(paths: Sequence[Path], every_run: bool = True) -> Study:
     missing. Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a
     file gives twice, and everything that `load_study` refuses.
     """
-    config: Settings = {}
-    for path in paths:
-        config = merge(config, read_yaml(path))
+    config: Settings = reduce(merge, map(read_yaml, paths), {})
     origin = " + ".join(str(path) for path in paths)
     return load_study(config, origin) if every_run else check(Study, config, origin)
 

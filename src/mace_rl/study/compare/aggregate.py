@@ -16,16 +16,11 @@ SCORED = ("final_return", "area_under_curve")
 
 def scores(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """Long frame env, variant, seed, metric, score of `SCORED`, from the frame of metrics.csv."""
-    parts = []
-    for environment, runs in table.groupby("env", sort=False):
-        random = settings.random_return_in(str(environment))
-        for metric in SCORED:
-            part = runs[["env", "variant", "seed"]].assign(metric=metric)
-            best = runs[metric].max()
-            # Where no run beats random actions there is nothing to be shared out.
-            part["score"] = (runs[metric] - random) / (best - random) if best > random else 0.0
-            parts.append(part)
-    return pd.concat(parts, ignore_index=True)
+    long = table.melt(["env", "variant", "seed"], list(SCORED), "metric", "score")
+    random = long["env"].map(settings.random_return_in)
+    best = long.groupby(["env", "metric"])["score"].transform("max")
+    # Where no run beats random actions there is nothing to be shared out.
+    return long.assign(score=((long["score"] - random) / (best - random)).where(best > random, 0.0))
 
 
 def interquartile_mean(values: np.ndarray, axis: int) -> np.ndarray:
@@ -46,13 +41,9 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         strata = [group["score"].to_numpy() for _, group in runs.groupby("env", sort=False)]
         smallest = min(len(values) for values in strata)
         generator = np.random.default_rng(settings.bootstrap_seed)
-        drawn = np.concatenate(  # the seeds of each environment resampled, [repetitions, runs]
-            [
-                values[generator.integers(len(values), size=(repetitions, len(values)))]
-                for values in strata
-            ],
-            axis=1,
-        )
+        places = (generator.integers(len(own), size=(repetitions, len(own))) for own in strata)
+        # The seeds of each environment resampled, [repetitions, runs].
+        drawn = np.hstack([own[place] for own, place in zip(strata, places, strict=True)])
         row = {"metric": metric, "variant": variant, "runs": len(runs)}
         for name, estimate in (("mean", np.mean), ("iqm", interquartile_mean)):
             resampled = estimate(drawn, axis=-1)

@@ -66,9 +66,7 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 
 def _compare(
-    environments: dict[str, dict[str, pd.DataFrame]],
-    pair: list[str],
-    settings: MetricsConfig,
+    environments: dict[str, dict[str, pd.DataFrame]], pair: list[str], settings: MetricsConfig
 ) -> list[Comparison]:
     """A row for each metric, but for `p_holm`, from metrics.csv by environment and variant.
 

@@ -29,12 +29,9 @@ def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metr
 
     Only what counts episodes can be read in several ways.
     """
-    found = [metric for metric in all_metrics(settings) if metric.unit == "episodes"]
+    both = itertools.product(table1.metrics, all_metrics(settings))
     return [
-        (kind, metric)
-        for kind in table1.metrics
-        for metric in found
-        if metric.name.startswith(kind)
+        (kind, one) for kind, one in both if one.unit == "episodes" and one.name.startswith(kind)
     ]
 
 
@@ -105,17 +102,11 @@ def _measured(
         str(name): np.where(own[metric.flag] == 1, np.inf, own[metric.name])
         for name, own in runs.groupby("variant")
     }
-    p_values = [
-        np.nan
-        if name == first
-        else logrank(
-            reached[first],
-            reached[name],
-            settings.bootstrap_repetitions,
-            np.random.default_rng(settings.bootstrap_seed),
-        )
-        for name in variants
-    ]
+    p_values = [np.nan] * len(variants)
+    for place, name in enumerate(variants):
+        if name != first:
+            how = settings.bootstrap_repetitions, np.random.default_rng(settings.bootstrap_seed)
+            p_values[place] = logrank(reached[first], reached[name], *how)
     return rows.assign(rank=rows["mean"].rank(method="min").astype(int), p_value=p_values)
 
 
@@ -128,9 +119,7 @@ def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str
     return names[reading]
 
 
-def in_order(
-    table: pd.DataFrame,
-) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
+def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
     """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
     found = [
         ((str(kind), str(reading), str(source)), rows)

@@ -5,7 +5,9 @@ that it draws them from. An interval is a pair (low, high), both NaN where one s
 After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -46,14 +48,14 @@ def mean_interval(
         error = np.std(values, axis=0, ddof=1) / np.sqrt(seeds)
         half = scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2) * error
         return mean - half, mean + half
-    drawn = draws(seeds, repetitions, generator)
-    flat = values.reshape(seeds, -1)  # [seeds, points]
+    drawn = draws(seeds, repetitions, generator)  # the same resampled seeds serve every point
+    flat, place = np.unique(values.reshape(seeds, -1), axis=1, return_inverse=True)
     points = max(1, CHUNK // repetitions)
-    bounds = [  # the same resampled seeds serve every point
+    bounds = [
         percentiles(drawn @ flat[:, start : start + points] / seeds, confidence, seeds)
         for start in range(0, flat.shape[1], points)
     ]
-    low, high = np.concatenate(bounds, axis=1)
+    low, high = np.concatenate(bounds, axis=1)[:, place.ravel()]
     return low.reshape(mean.shape), high.reshape(mean.shape)
 
 
@@ -64,10 +66,7 @@ def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, n
 
 
 def paired_comparison(
-    differences: np.ndarray,
-    confidence: float,
-    repetitions: int,
-    generator: np.random.Generator,
+    differences: np.ndarray, confidence: float, repetitions: int, generator: np.random.Generator
 ) -> PairedComparison:
     """Compare x with y, of which `differences` are x - y by seed, [seeds] or [seeds, metrics].
 
@@ -95,13 +94,11 @@ def equivalence(
     """
     if min(map(len, differences)) == 1:
         return np.nan
-    above, below = (
-        _weighted([values - end for values in differences]) for end in (-margin, margin)
-    )
-    return max(
-        float(_sign_flips(above, repetitions, generator, "greater")),
-        float(_sign_flips(below, repetitions, generator, "less")),
-    )
+    p_values = []
+    for end, alternative in ((-margin, "greater"), (margin, "less")):
+        shifted = _weighted([values - end for values in differences])
+        p_values.append(float(_sign_flips(shifted, repetitions, generator, alternative)))
+    return max(p_values)
 
 
 def _sign_flips(
@@ -111,17 +108,9 @@ def _sign_flips(
     alternative: str = "two-sided",
 ) -> np.ndarray:
     """p value of the sign-flip test of each mean over the first axis, exact where it can be."""
-    tested = scipy.stats.permutation_test(
-        (values,),
-        np.mean,
-        permutation_type="samples",
-        alternative=alternative,
-        n_resamples=repetitions,
-        batch=BATCH,
-        rng=generator,
-        vectorized=True,
-    )
-    return tested.pvalue
+    how = {"permutation_type": "samples", "alternative": alternative, "vectorized": True}
+    how |= {"n_resamples": repetitions, "batch": BATCH, "rng": generator}
+    return scipy.stats.permutation_test((values,), np.mean, **how).pvalue
 
 
 def _weighted(differences: Sequence[np.ndarray]) -> np.ndarray:
@@ -163,10 +152,7 @@ def stratified_comparison(
 
 
 def logrank(
-    x: np.ndarray,
-    y: np.ndarray,
-    repetitions: int,
-    generator: np.random.Generator,
+    x: np.ndarray, y: np.ndarray, repetitions: int, generator: np.random.Generator
 ) -> float:
     """Two-sided p value of the log-rank test that x [n] and y [m] come from the same distribution.
 
@@ -186,23 +172,16 @@ def logrank(
     def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
         return np.round(np.mean(x, axis=axis) - np.mean(y, axis=axis), 12)  # ties
 
+    how = {"n_resamples": repetitions, "batch": BATCH, "vectorized": True}
     if scipy.special.comb(len(times), len(x)) <= repetitions:
-        tested = scipy.stats.permutation_test(
-            (scores[: len(x)], scores[len(x) :]),
-            statistic,
-            n_resamples=repetitions,
-            batch=BATCH,
-            vectorized=True,
-        )
-    else:  # which `permutation_test` would draw one by one
-        tested = scipy.stats.monte_carlo_test(
-            scores,
-            lambda size: generator.permuted(np.broadcast_to(scores, size), axis=-1),
-            lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
-            n_resamples=repetitions,
-            batch=BATCH,
-            vectorized=True,
-        )
+        both = scores[: len(x)], scores[len(x) :]
+        return float(scipy.stats.permutation_test(both, statistic, **how).pvalue)
+    tested = scipy.stats.monte_carlo_test(  # `permutation_test` would draw orders one by one
+        scores,
+        lambda size: scores[orders(size[0], size[1], generator)],
+        lambda scores, axis: statistic(scores[..., : len(x)], scores[..., len(x) :], axis),
+        **how,
+    )
     return float(tested.pvalue)
 
 
@@ -225,7 +204,7 @@ def probability_of_improvement(
         drawn_x, drawn_y = (draws(len(runs), repetitions, generator) for runs in (x, y))
         means += wins.mean(axis=(0, 1)) / len(pairs)
         for metric in range(metrics):
-            won = np.sum((drawn_x @ wins[:, :, metric]) * drawn_y, axis=1)
+            won = np.einsum("ry,ry->r", drawn_x @ wins[:, :, metric], drawn_y)
             resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
     fewest = min(len(runs) for both in pairs for runs in both)
     low, high = percentiles(resampled, confidence, fewest)
@@ -244,6 +223,31 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
     return np.minimum(adjusted, 1)
 
 
+def _remembered(
+    draw: Callable[[int, int, np.random.Generator], np.ndarray],
+) -> Callable[[int, int, np.random.Generator], np.ndarray]:
+    """`draw`, which most rows of a table call with equal generators, drawing only once for each.
+
+    The generator moves on as if it had been drawn from.
+    """
+
+    @lru_cache(maxsize=64)
+    def drawn(first: int, second: int, state: str) -> tuple[np.ndarray, str]:
+        generator = np.random.default_rng()
+        generator.bit_generator.state = json.loads(state)
+        values = draw(first, second, generator)
+        values.flags.writeable = False
+        return values, json.dumps(generator.bit_generator.state)
+
+    def again(first: int, second: int, generator: np.random.Generator) -> np.ndarray:
+        values, after = drawn(first, second, json.dumps(generator.bit_generator.state))
+        generator.bit_generator.state = json.loads(after)
+        return values
+
+    return again
+
+
+@_remembered
 def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.ndarray:
     """How often each of `count` values is in each bootstrap sample of that size.
 
@@ -253,6 +257,12 @@ def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.nd
     drawn += count * np.arange(repetitions)[:, None]  # each sample has a range of its own
     times = np.bincount(drawn.ravel(), minlength=repetitions * count)
     return times.reshape(repetitions, count).astype(np.float64)
+
+
+@_remembered
+def orders(repetitions: int, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Random orders of `count` values, int64 [repetitions, count]."""
+    return generator.permuted(np.tile(np.arange(count), (repetitions, 1)), axis=-1)
 
 
 def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:

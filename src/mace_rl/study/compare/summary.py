@@ -7,10 +7,13 @@ import pandas as pd
 
 from mace_rl.study.claims_config import Table1Config
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import all_metrics, metric_units
 from mace_rl.study.metrics_config import MetricsConfig
 
 DIGITS = {"episodes": 0, "return": 1, "share": 2}  # after the point, by a metric's unit, at least
+
+COLUMNS = ["env", "variant", "metric", "mean", "low", "high", "seeds", "censored", "episodes"]
+COLUMNS += ["paper"]  # of table1.csv and supplement.csv
 
 
 def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) -> pd.DataFrame:
@@ -29,22 +32,13 @@ def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) 
             low, high = interval(values, settings)
             limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
             low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
-            rows.append(
-                {
-                    "env": environment,
-                    "variant": variant,
-                    "metric": metric.name,
-                    "mean": values.mean(),
-                    "low": float(low),
-                    "high": float(high),
-                    "seeds": len(values),
-                    "censored": int(runs[metric.flag].sum()) if metric.flag in runs else 0,
-                    "episodes": int(runs["episodes"].iloc[0]),
-                    "paper": table1.value(str(environment), str(variant), metric.name),
-                }
-            )
-    fractions = any(isinstance(row["paper"], float) for row in rows)
-    return pd.DataFrame(rows).astype({"paper": "Float64" if fractions else "Int64"})
+            censored = int(runs[metric.flag].sum()) if metric.flag in runs else 0
+            in_paper = table1.value(str(environment), str(variant), metric.name)
+            found = environment, variant, metric.name, values.mean(), float(low), float(high)
+            rows.append((*found, len(values), censored, int(runs["episodes"].iloc[0]), in_paper))
+    fractions = any(isinstance(in_paper, float) for *_, in_paper in rows)
+    frame = pd.DataFrame(rows, columns=COLUMNS)
+    return frame.astype({"paper": "Float64" if fractions else "Int64"})
 
 
 def split(means: pd.DataFrame, table1: Table1Config) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -58,10 +52,9 @@ def digits_by_metric(table: pd.DataFrame, settings: MetricsConfig) -> dict[tuple
 
     Of returns as many as give the largest mean three digits: some environments' are all below 1.
     """
-    units = {metric.name: metric.unit for metric in all_metrics(settings)}
     found = {}
     for (environment, metric), rows in table.groupby(["env", "metric"], sort=False):
-        unit, largest = units[str(metric)], rows["mean"].abs().max()
+        unit, largest = metric_units(settings)[str(metric)], rows["mean"].abs().max()
         digits = DIGITS[unit]
         if unit == "return" and largest > 0:
             digits = max(digits, 2 - math.floor(math.log10(largest)))

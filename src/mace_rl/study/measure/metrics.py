@@ -1,9 +1,8 @@
 """What is measured on one run: how well it ends, and how soon it gets there (docs/metrics.md).
 
-`METRICS` is the table of it, and columns, tables and comparisons follow it. A metric is a pure
-function of a `LearningCurve`; further ones, outside of this package, are added by the configuration
-(`metrics.custom`). An metric in episodes that a run never attains is reported as E and flagged as
-censored, never dropped; E is then a lower bound.
+`METRICS` lists them; columns, tables and comparisons follow it. A metric is a pure function of a
+`LearningCurve`; `metrics.custom` in the configuration adds the user's own. A run that never attains
+a metric in episodes counts with E and is flagged as censored: E is then a lower bound.
 """
 
 import math
@@ -177,9 +176,8 @@ def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
 def sample_efficiency(curve: LearningCurve) -> Attained:
     """The first episode with a return ≥ threshold · final (paper, literally).
 
-    A single lucky episode is enough. Where returns are negative the bar lies *above* the final
-    return (75 % of -85 is -63.75) and may never be reached. Censored too, and this the paper does
-    not say: the run has not `learned`.
+    One lucky episode is enough. Where returns are negative the bar lies *above* the final return
+    (75 % of -85 is -63.75). Censored: never reached or, as the paper does not say, not `learned`.
     """
     reached = curve.returns >= curve.settings.threshold * curve.final
     return curve.first(reached & curve.learned)
@@ -189,10 +187,8 @@ def convergence_steps(curve: LearningCurve) -> Attained:
     """The point where the slope of the moving average becomes minimal (paper).
 
     Our reading: the first episode, once the average has come threshold of the way from random to
-    final, at which its slope is down to `convergence_slope` of the steepest so far. It is steady
-    from seed to seed and sees a delay (simulated: docs/metrics.md).
-
-    Censored: the slope never falls that far, the run has not `learned`, or E < 2 windows.
+    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored: the
+    slope never falls that far, the run has not `learned`, or E < 2 windows.
     """
     settings, window = curve.settings, curve.settings.moving_average
     high = curve.average >= curve.bar(curve.final)
@@ -244,7 +240,8 @@ def sample_efficiency_common(curve: LearningCurve) -> Attained:
     The bar is random + threshold · (reference - random), the same for every variant: ending worse
     does not lower it. Censored: never reached.
     """
-    return _average_reaches(curve, curve.reference)
+    reached = curve.average >= curve.bar(curve.reference)
+    return curve.first(reached, curve.settings.moving_average)
 
 
 def sample_efficiency_range(curve: LearningCurve) -> Attained:
@@ -253,8 +250,8 @@ def sample_efficiency_range(curve: LearningCurve) -> Attained:
     The bar is random + threshold · (final - random): it means the same for negative returns, and
     one lucky episode does not reach it. Censored: the run has not `learned`.
     """
-    reached = _average_reaches(curve, curve.final)
-    return reached if curve.learned else Attained(len(curve.returns), True)
+    reached = curve.average >= curve.bar(curve.final)
+    return curve.first(reached & curve.learned, curve.settings.moving_average)
 
 
 def convergence_steps_range(curve: LearningCurve) -> Attained:
@@ -335,16 +332,21 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     return tuple(metrics)
 
 
+def metric_units(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.unit for metric in all_metrics(settings)}
+
+
+def metric_labels(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.label for metric in all_metrics(settings)}
+
+
 def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     """The columns of metrics.csv, one row per run, with these metrics."""
     run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}
     values = {metric.name: COLUMN_TYPES[metric.unit] for metric in metrics}
     return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
-
-
-def _average_reaches(curve: LearningCurve, goal: float) -> Attained:
-    """The first episode whose moving average is at the bar for `goal`."""
-    return curve.first(curve.average >= curve.bar(goal), curve.settings.moving_average)
 
 
 def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:

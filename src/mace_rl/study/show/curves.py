@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from mace_rl.records import RecordError, RunKey
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.measure.metrics import moving_average
+from mace_rl.study.measure.metrics import metric_labels, moving_average
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 
 MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
@@ -56,6 +56,17 @@ class PlotStyle(NamedTuple):
     metrics: Mapping[str, str]  # labels
 
 
+def plot_style(
+    settings: MetricsConfig,
+    layout: Mapping[str, Any],
+    labels: Mapping[str, str],
+    colours: Mapping[str, str],
+) -> PlotStyle:
+    """The style of a study that is measured by these settings; `layout`: of a `FigureConfig`."""
+    names = metric_labels(settings)
+    return PlotStyle(FigureConfig(**layout), settings.confidence, labels, colours, names)
+
+
 def quantity(figure: str, settings: MetricsConfig) -> Quantity:
     """What the figure of this number, "1" or "2", shows."""
     if figure == "2":
@@ -85,7 +96,10 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
         values = frame[shown.column].to_numpy()
         head = values[: shown.window - 1]
         average = np.concatenate(
-            [np.cumsum(head) / np.arange(1, len(head) + 1), moving_average(values, shown.window)]
+            [
+                np.cumsum(head) / np.arange(1, len(head) + 1),
+                moving_average(values, shown.window),
+            ]
         )
         stride = math.ceil(len(values) / MAX_POINTS)
         kept = np.arange(len(values) - 1, -1, -stride)[::-1]
@@ -119,10 +133,7 @@ def mean_curves(
 
 
 def draw_figure(
-    curves: pd.DataFrame,
-    single_seeds: pd.DataFrame,
-    shown: Quantity,
-    look: PlotStyle,
+    curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> Figure:
     """A figure from `mean_curves` and `seed_curves`: one panel per environment.
 
@@ -209,16 +220,17 @@ def legend(figure: Figure, explained: str) -> None:
         line.set_linewidth(2)
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure of this module as PDF (fonts embedded as TrueType) or as PNG.
+def save_figure(figure: Figure, *paths: str | Path) -> None:
+    """Write a figure as PDF (fonts embedded as TrueType) or PNG, by the suffix of each path.
 
-    Without date and version, so that an equal figure gives an equal file.
+    Without date and version, so that an equal figure gives an equal file. Each file's layout
+    starts from that of the one before: another order gives files that differ a little.
     """
-    fields = (
-        ("CreationDate", "Creator", "Producer") if Path(path).suffix == ".pdf" else ("Software",)
-    )
+    fields = {".pdf": ("CreationDate", "Creator", "Producer"), ".png": ("Software",)}
     with style():
-        figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dict.fromkeys(fields))
+        for path in paths:
+            metadata = dict.fromkeys(fields[Path(path).suffix])
+            figure.savefig(path, dpi=DOTS_PER_INCH, metadata=metadata)
 
 
 def figure_as_svg(figure: Figure) -> str:

@@ -10,7 +10,7 @@ from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
 from mace_rl.study.compare.summary import from_to
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
-from mace_rl.study.show.cells import COLUMNS_PER_BLOCK, DASH, Cell
+from mace_rl.study.show.tables import COLUMNS_PER_BLOCK, DASH, Cell
 
 INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
 
@@ -50,26 +50,12 @@ def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
         for name, value in tables.table2(ppo, paper).to_numpy()
     ]
     end = len(paper.rows) + 1  # and Adam
-    lines = [
-        r"\begin{table}[tbp]",
-        r"\centering",
-        r"\caption{PPO hyperparameters: those of the paper, and below the line those that it leaves"
-        " open.}",
-        r"\label{tab:table2}",
-        r"\par\medskip",
-        r"\footnotesize",
-        r"\begin{tabular}{@{}p{0.42\linewidth}l@{}}",
-        r"\toprule",
-        r"Hyperparameter & Value \\",
-        r"\midrule",
-        *rows[:end],
-        r"\midrule",
-        *rows[end:],
-        r"\bottomrule",
-        r"\end{tabular}",
-        r"\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
+    what = "PPO hyperparameters: those of the paper, and below the line those that it leaves open."
+    columns = r"tabular}{@{}p{0.42\linewidth}l@{}"
+    body = [*rows[:end], r"\midrule", *rows[end:]]
+    return _float(
+        "table", what, "tab:table2", *_lines(columns, r"Hyperparameter & Value \\", *body)
+    )
 
 
 def _how(table: pd.DataFrame, confidence: float) -> str:
@@ -113,18 +99,20 @@ def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
     head, *names = frame.columns
     starts = range(0, len(names), COLUMNS_PER_BLOCK)
     blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
-    lines = [
-        r"\begin{table*}[tbp]",
-        r"\centering",
-        rf"\caption{{{caption}}}",
-        rf"\label{{{label}}}",
-        r"\par\medskip",
-        r"\footnotesize",
-        r"\setlength{\tabcolsep}{2pt}",
-        "\n\\par\\medskip\n".join(_tabular(frame[[head, *block]]) for block in blocks),
-        r"\end{table*}",
-    ]
-    return "\n".join(lines) + "\n"
+    tabulars = "\n\\par\\medskip\n".join(_tabular(frame[[head, *block]]) for block in blocks)
+    return _float("table*", caption, label, r"\setlength{\tabcolsep}{2pt}", tabulars)
+
+
+def _float(kind: str, caption: str, label: str, *body: str) -> str:
+    lines = [rf"\begin{{{kind}}}[tbp]", r"\centering", rf"\caption{{{caption}}}"]
+    lines += [rf"\label{{{label}}}", r"\par\medskip", r"\footnotesize", *body]
+    return "\n".join([*lines, rf"\end{{{kind}}}"]) + "\n"
+
+
+def _lines(columns: str, head: str, *body: str) -> list[str]:
+    """A tabular, line by line; `columns` begins with its kind."""
+    rules = [rf"\begin{{{columns}}}", r"\toprule", head, r"\midrule", *body, r"\bottomrule"]
+    return [*rules, rf"\end{{{columns.partition('}')[0]}}}"]
 
 
 def _tabular(frame: pd.DataFrame) -> str:
@@ -135,16 +123,9 @@ def _tabular(frame: pd.DataFrame) -> str:
         [r"\newline ".join(_name(name)), *map(latex_cell, cells)]
         for name, *cells in frame.to_numpy()
     ]
-    lines = [
-        rf"\begin{{tabular*}}{{\textwidth}}{{@{{\extracolsep{{\fill}}}}{columns}@{{}}}}",
-        r"\toprule",
-        " & ".join(names) + r" \\",
-        r"\midrule",
-        "\n\\addlinespace\n".join(rf"\raggedright {' & '.join(row)} \\" for row in rows),
-        r"\bottomrule",
-        r"\end{tabular*}",
-    ]
-    return "\n".join(lines)
+    columns = rf"tabular*}}{{\textwidth}}{{@{{\extracolsep{{\fill}}}}{columns}@{{}}"
+    body = "\n\\addlinespace\n".join(rf"\raggedright {' & '.join(row)} \\" for row in rows)
+    return "\n".join(_lines(columns, " & ".join(names) + r" \\", body))
 
 
 def latex_cell(cell: str | Cell) -> str:

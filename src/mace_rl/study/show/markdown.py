@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from mace_rl.study.show.cells import COLUMNS_PER_BLOCK, Cell
 from mace_rl.study.show.sections import Section
+from mace_rl.study.show.tables import COLUMNS_PER_BLOCK, Cell
 
 
 def page(title: str, origin: str, sections: Iterable[Section], pictures: Sequence[str] = ()) -> str:

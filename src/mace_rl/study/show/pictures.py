@@ -18,7 +18,7 @@ from mace_rl.study.compare.estimates import CONFIDENCE, WORTH_MENTIONING
 from mace_rl.study.compare.ledger import Answer, Finding, SizedFinding
 from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import metric_labels
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
 from mace_rl.study.show.tables import SOLVED
@@ -118,10 +118,8 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
                 colour, label = look.colours[row["variant"]], look.labels[row["variant"]]
                 axes.axhspan(row["low"], row["high"], color=colour, alpha=0.2, linewidth=0)
                 axes.axhline(row["mean"], color=colour, linewidth=1.3, label=label, zorder=1)
-            ticks = [
-                look.labels[name].removeprefix("β = ").partition(" (")[0]
-                for name in fixed["variant"]
-            ]
+            labels = (look.labels[name].removeprefix("β = ") for name in fixed["variant"])
+            ticks = [label.partition(" (")[0] for label in labels]
             axes.set_xticks(range(len(fixed)), ticks, rotation=90)
             axes.set_title(str(environment))
         level = f"{100 * look.confidence:g} % interval"
@@ -196,8 +194,7 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     if any(other.environments != part.environments for other in parts):
         words += [name.partition("-")[0] for name in part.environments]
     if any(other.metric != part.metric for other in parts):
-        labels = {metric.name: metric.label for metric in all_metrics(source.settings)}
-        words.append(labels.get(part.metric, part.metric).lower())
+        words.append(metric_labels(source.settings).get(part.metric, part.metric).lower())
     if part.baseline:
         words.append(f"over {source.claims.variants.get(part.baseline, part.baseline)}")
     return ", ".join(words)
@@ -224,9 +221,8 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
             own = table[table["measured"] == how]
             for outcome, (colour, label) in outcomes.items():
                 parts = own[own["outcome"] == outcome]
-                axes.hlines(
-                    parts["place"], parts["low"], parts["high"], color=colour, linewidth=1.2
-                )
+                bars = parts["place"], parts["low"], parts["high"]
+                axes.hlines(*bars, color=colour, linewidth=1.2)
                 dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(parts["difference"], parts["place"], "o", **dots)
             if own["paper"].notna().any():
@@ -243,8 +239,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
                 colour, _ = outcomes[answer]
                 axes.text(1.8 * reach, top + 0.5, verdict, color=colour, ha="right", **small)
                 for panel in (names, axes):
-                    grey = "0.9" if shade % 2 else "white"
-                    panel.axhspan(top, end, color=grey, zorder=0)
+                    panel.axhspan(top, end, color="0.9" if shade % 2 else "white", zorder=0)
                 if how == ways[-1]:
                     names.text(0, (top + end) / 2, said[name], **small)
                     for place, part in zip(claim["place"], claim["part"], strict=True):
@@ -280,6 +275,11 @@ def _placed(
     return table.assign(place=pd.concat(placed)), blocks
 
 
+def readings(source: Source) -> pd.DataFrame:
+    """readings.csv, which `compare.readings` makes."""
+    return source.data["readings"]
+
+
 def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
     environments, lines = list(table["env"].unique()), in_order(table)
@@ -296,23 +296,17 @@ def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
                     shift = step * (variants.index(name) - (len(variants) - 1) / 2)
                     colour = look.colours[name]
                     axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
-                    axes.plot(
-                        row["mean"],
-                        place + shift,
-                        "o",
-                        markersize=3.5,
-                        color=colour,
-                        markerfacecolor="white" if source == PAPER else colour,
-                        label=look.labels[name] if place == 1 else None,
-                    )
+                    dot: dict[str, Any] = {"color": colour, "markersize": 3.5}
+                    dot["markerfacecolor"] = "white" if source == PAPER else colour
+                    dot["label"] = look.labels[name] if place == 1 else None
+                    axes.plot(row["mean"], place + shift, "o", **dot)
             for place in range(len(lines) - 1):
                 axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)
             axes.set_xlim(left=-0.03 * axes.get_xlim()[1])  # dots at 0 are whole
             axes.locator_params(axis="x", nbins=4)
             axes.set_title(environment)
-        panels[0].set_yticks(
-            range(len(lines)), [title(*key, look.metrics) for key, _ in lines], fontsize="small"
-        )
+        titles = [title(*key, look.metrics) for key, _ in lines]
+        panels[0].set_yticks(range(len(lines)), titles, fontsize="small")
         panels[0].invert_yaxis()
         for axes in panels[1:]:
             axes.sharey(panels[0])
@@ -335,9 +329,5 @@ PICTURES = {
     "constants": Picture(constants, draw_constants, lambda source: bool(source.settings.constants)),
     "solved": Picture(solved, draw_solved, lambda source: bool(source.settings.solved_return)),
     "forest": Picture(forest, draw_forest, lambda source: bool(source.answers)),
-    "readings": Picture(
-        lambda source: source.data["readings"],
-        draw_readings,
-        lambda source: "readings" in source.data,
-    ),
+    "readings": Picture(readings, draw_readings, lambda source: "readings" in source.data),
 }

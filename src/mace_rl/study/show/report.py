@@ -24,15 +24,15 @@ from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.estimates import FEWEST_SEEDS
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import metric_labels
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 from mace_rl.study.show import sections, tables
 from mace_rl.study.show.animations import Animation
-from mace_rl.study.show.cells import Cell, number
 from mace_rl.study.show.curves import PlotStyle, quantity, style
 from mace_rl.study.show.pictures import PICTURES, Source
 from mace_rl.study.show.sections import Data, Section
 from mace_rl.study.show.svg import PAGE_COLOURS, panels, svg
+from mace_rl.study.show.tables import Cell, number
 
 TEMPLATE = Path(__file__).with_name("report.html")
 FIGURES = ("1", "2")
@@ -67,7 +67,11 @@ def page(
     )
     environment.filters |= {"three_digits": three_digits, "table": as_html, "note": _note}
     metrics, records = data["metrics"], provenance.records
-    names = dict(look.labels) | {metric.name: metric.label for metric in all_metrics(settings)}
+
+    def of(figure: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+        return data[f"figure{figure}"], data[f"figure{figure}_seeds"]
+
+    names = dict(look.labels) | metric_labels(settings)
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
         families=sections.by_family(answers),
@@ -84,7 +88,7 @@ def page(
         labels=look.labels,
         colours={variant: style()(to_hex)(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
-        figures={figure: _panels(data, figure, settings, look) for figure in FIGURES},
+        figures={name: panels(*of(name), quantity(name, settings), look) for name in FIGURES},
         curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
         shown=animations[0],
         missing=animations[1],
@@ -135,21 +139,14 @@ def _note(text: str) -> Markup:
     return Markup(re.sub(r"\*([^*]+)\*", r"<i>\1</i>", html.escape(text)))
 
 
-def _panels(data: Data, figure: str, settings: MetricsConfig, look: PlotStyle) -> dict[str, str]:
-    """Figure 1 or 2, panel by panel."""
-    curves, seeds = data[f"figure{figure}"], data[f"figure{figure}_seeds"]
-    return panels(curves, seeds, quantity(figure, settings), look)
-
-
 def _pictures(source: Source, look: PlotStyle) -> dict[str, str]:
     """Those that are wider than a phone, as SVG by name; those that this study has data for."""
     look = look._replace(layout=FigureConfig(columns=3))
-    drawn = {
-        name: picture.draw(picture.data(source), look)
+    return {
+        name: svg(picture.draw(picture.data(source), look), name, name.replace("_", " "))
         for name, picture in PICTURES.items()
         if picture.fits(source)
     }
-    return {name: svg(figure, name, name.replace("_", " ")) for name, figure in drawn.items()}
 
 
 def _sections(
@@ -157,33 +154,31 @@ def _sections(
     claims: ClaimsConfig,
     provenance: Provenance,
     settings: MetricsConfig,
-    labels: Mapping[str, str],
+    names: Mapping[str, str],
 ) -> dict[str, Section]:
     """Every table but the ledger's, by its title, and three that the pages of Markdown have not."""
-    compared = tables.named(data["comparisons"], labels)
+    compared = tables.named(data["comparisons"], names)
     means = pd.concat([data["table1"], data["supplement"]])
     note = (
         "Differences are paired by seed, with Holm's correction over the whole table. *P* is the"
         " probability that a run of the first is better than one of the second."
     )
-    costs = tables.costs(provenance.records, data["metrics"], labels)
+    costs = tables.costs(provenance.records, data["metrics"], names)
     interruptions = sum(len(record["interruptions"]) for record in provenance.records)
     machine = "As each run's run.json has it; one core a run, no GPU."
-    found = [
-        *sections.of_runs(data, claims, settings, labels),
-        Section(
-            "Variants against each other, on every metric",
+    others = {
+        "Variants against each other, on every metric": (
             note,
             tables.comparisons(compared, means, settings),
         ),
-        Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
-        Section(
-            "PPO's settings, as resolved",
+        "Costs": (f"{machine} Interruptions: {interruptions}.", costs),
+        "PPO's settings, as resolved": (
             "Table 2; for LaTeX table2.tex.",
             tables.table2(provenance.ppo, claims.table2),
         ),
-    ]
-    return {section.title: section for section in found}
+    }
+    found = {section.title: section for section in sections.of_runs(data, claims, settings, names)}
+    return found | {title: Section(title, *own) for title, own in others.items()}
 
 
 def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, int]]]:

@@ -54,7 +54,8 @@ def read_data(
     how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
     files = {name: path for name, path in found.items() if str(path).endswith(".csv")}
     data = {name: pd.read_csv(path, **how) for name, path in files.items()}
-    data["metrics"] = read_metrics(found["metrics"], runs, settings)
+    if "metrics" in found:
+        data["metrics"] = read_metrics(found["metrics"], runs, settings)
     if "betas" in found:
         data["betas"] = read_table(found["betas"], betas_columns(settings))
     return data, read_ledger(found["ledger"]) if "ledger" in found else []

@@ -17,10 +17,7 @@ MAX_POINTS = 250  # per curve: a point for every pixel and a half
 
 
 def panels(
-    curves: pd.DataFrame,
-    single_seeds: pd.DataFrame,
-    shown: Quantity,
-    look: PlotStyle,
+    curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> dict[str, str]:
     """The panel of each environment, as `draw_figure` draws it from the same data.
 

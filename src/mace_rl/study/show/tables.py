@@ -1,14 +1,15 @@
 """Every table of a study, as a frame of cells.
 
-A frame of cells has a table's heads as columns and what is printed as values: words (`str`) and
-`Cell`s. `markdown`, `report` and `latex` print it. Variants are called what they are called
-in the data: `named` gives them other names first.
+A frame of cells has a table's heads as columns; its values are words (`str`) and `Cell`s of numbers
+with intervals. `markdown`, `report` and `latex` print it. Variants have the names that the data
+have: `named` gives them others first.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
@@ -18,13 +19,52 @@ from mace_rl.study.compare.ledger import Answer, SizedFinding
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import metric_labels, metric_units
 from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show.cells import Cell, Value, estimate, number
 
+COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
+DASH = "\u2013"  # in the place of a number that there is not
 CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
+
+
+class Value(NamedTuple):
+    """One number, or words, as printed."""
+
+    text: str
+    low: str = ""  # of its interval; empty where none is asked for
+    high: str = ""
+    mark: str = ""  # †, and of how many seeds
+    best: bool = False
+
+
+class Cell(NamedTuple):
+    """Several values in one cell, and what is to be said beside them. (One word is a `str`.)"""
+
+    values: Sequence[Value]
+    joint: str = " / "
+    note: str = ""
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """A number with a true minus, and without one before a zero; a dash where there is none."""
+    if value is None or np.isnan(value):
+        return DASH
+    return f"{value:z.{digits}f}".replace("-", "−")
+
+
+def estimate(
+    value: float | None,
+    low: float | None,
+    high: float | None,
+    digits: int = 0,
+    mark: str = "",
+    best: bool = False,
+) -> Value:
+    """A number with its interval, of dashes where there is none."""
+    text, start, end = (number(one, digits) for one in (value, low, high))
+    return Value(text, start, end, mark, best)
 
 
 def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
@@ -40,45 +80,37 @@ def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) ->
     as displayed; ties all are, and a mean of seeds that all never got there is not. The paper's
     numbers stand beside.
     """
-    digits, units = (
-        digits_by_metric(table, settings),
-        {metric.name: metric.unit for metric in all_metrics(settings)},
-    )
+    digits = digits_by_metric(table, settings)
     best = {}
     attained = table[table["censored"] < table["seeds"]]
-    for (env, metric), group in attained.groupby(["env", "metric"]):
+    for (env, metric), means in attained.groupby(["env", "metric"])["mean"]:
         key = str(env), str(metric)
-        first = group["mean"].min() if units[key[1]] == "episodes" else group["mean"].max()
+        first = means.min() if metric_units(settings)[key[1]] == "episodes" else means.max()
         best[key] = number(first, digits[key])
 
-    def mean(row: pd.Series) -> Value:
-        key = row["env"], row["metric"]
-        some = row["censored"] < row["seeds"]
-        return _mean(row, digits[key], some and number(row["mean"], digits[key]) == best[key])
-
     def cell(runs: pd.DataFrame) -> Cell:
-        rows = [runs[runs["metric"] == metric].iloc[0] for metric in paper.metrics]
-        published = [
-            number(row["paper"], digits[row["env"], row["metric"]])
-            for row in rows
-            if not pd.isna(row["paper"])
-        ]
-        note = f"paper: {' / '.join(published)}" if published else ""
-        return Cell([mean(row) for row in rows], note=note)
+        values, published = [], []
+        for metric in paper.metrics:
+            row = runs[runs["metric"] == metric].iloc[0]
+            key = row["env"], metric
+            shown = number(row["mean"], digits[key])
+            is_best = row["censored"] < row["seeds"] and shown == best[key]
+            values.append(_mean(row, digits[key], is_best))
+            published += [] if pd.isna(row["paper"]) else [number(row["paper"], digits[key])]
+        return Cell(values, note=f"paper: {' / '.join(published)}" if published else "")
 
     return _grid(table, cell, "Algorithm")
 
 
 def counts_episodes(settings: MetricsConfig, paper: Table1Config) -> bool:
     """Whether all metrics of Table 1 do, of which fewer are better."""
-    units = {metric.name: metric.unit for metric in all_metrics(settings)}
-    return all(units[metric] == "episodes" for metric in paper.metrics)
+    return all(metric_units(settings)[metric] == "episodes" for metric in paper.metrics)
 
 
 def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.DataFrame]:
     """By environment, a row for each metric of a `summary` and a column for each variant."""
     digits = digits_by_metric(table, settings)
-    labelled = table.assign(label=table["metric"].map(_labels(settings)))
+    labelled = table.assign(label=table["metric"].map(metric_labels(settings)))
     return {
         str(environment): _grid(
             own,
@@ -114,7 +146,7 @@ def solved(runs: pd.DataFrame) -> pd.DataFrame:
 
 def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
-    digits, labels = digits_by_metric(means, settings), _labels(settings)
+    digits, labels = digits_by_metric(means, settings), metric_labels(settings)
     return _rows(
         table,
         {
@@ -170,7 +202,7 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         ]
         return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
 
-    parts = [own.assign(title=title(*key, _labels(settings))) for key, own in in_order(table)]
+    parts = [own.assign(title=title(*key, metric_labels(settings))) for key, own in in_order(table)]
     frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
     return frame[["episodes", *table["env"].unique()]]
 
@@ -196,15 +228,10 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
     """A verdict for each claim of one family, in each way to measure it."""
     ways = list(answers[0].ways)
-    rows = [
-        [
-            answer.claim,
-            answer.statement,
-            *(Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways),
-            answer.paper,
-        ]
-        for answer in answers
-    ]
+    rows = []
+    for answer in answers:
+        said = [Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways]
+        rows.append([answer.claim, answer.statement, *said, answer.paper])
     frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
     return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
 
@@ -249,13 +276,9 @@ def costs(
     records: Sequence[Mapping[str, Any]], runs: pd.DataFrame, labels: Mapping[str, str]
 ) -> pd.DataFrame:
     """What the runs of each environment and variant took, by their `run.json`."""
-    frame = pd.DataFrame(
-        [
-            {key: record["config"][key] for key in ("environment", "variant", "seed")}
-            | {key: record[key] for key in ("seconds", "peak_memory_mb")}
-            for record in records
-        ]
-    ).rename(columns={"environment": "env"})
+    frame = pd.DataFrame(record["config"] | record for record in records)
+    frame = frame[["environment", "variant", "seed", "seconds", "peak_memory_mb"]]
+    frame = frame.rename(columns={"environment": "env"})
     frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
     rows = [
         [
@@ -281,11 +304,8 @@ def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
     own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
     rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
     rows += [["Optimizer", "Adam"]]
-    rows += [
-        [own[name], _setting(ppo, name)]
-        for name in PPOConfig.model_fields
-        if name not in paper.rows
-    ]
+    others = [name for name in PPOConfig.model_fields if name not in paper.rows]
+    rows += [[own[name], _setting(ppo, name)] for name in others]
     return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
 
 
@@ -312,10 +332,6 @@ def _rows(
     """A row for each of the table's, what is printed in each column by its head."""
     lines = [[cell(row) for cell in columns.values()] for _, row in table.iterrows()]
     return pd.DataFrame(lines, columns=list(columns))
-
-
-def _labels(settings: MetricsConfig) -> dict[str, str]:
-    return {metric.name: metric.label for metric in all_metrics(settings)}
 
 
 def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:

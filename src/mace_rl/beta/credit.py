@@ -1,0 +1,121 @@
+"""The credit of β: what it did to the extrinsic return, update by update, and what that adds up to.
+
+The update on rollout n moves the policy along P g(β), with g the policy gradient of the total
+advantage and P what Adam multiplies by. How the extrinsic return of the policies that result
+depends on β is therefore, up to a positive factor (Xu et al. 2018),
+
+    c_n = Σ_k ⟨g_E(θ_{n+k}; rollout n+k), P dg/dβ (θ_n; rollout n)⟩,   k = 1 … horizon.
+
+`docs/method.md` derives it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mace_rl.beta.controller import Effect
+from mace_rl.config.beta import MetaConfig
+from mace_rl.numerics.products import dot
+from mace_rl.state import Stateful, restored, saved
+
+SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
+
+
+@dataclass
+class PendingCredit:
+    """The β of one rollout, while the updates that follow tell what it did."""
+
+    direction: np.ndarray  # what it changes in the policy, of length 1, or 0
+    strength: float  # of the bonus in that update, at most 1
+    credit: float = 0.0
+    updates: int = 0  # that judged it so far
+
+
+class Judge(Stateful):
+    """Credits the β of each rollout by the next `horizon` updates.
+
+    Each term is in units of its usual size, with both vectors per unit of advantage, and counts as
+    much as there is of extrinsic and of intrinsic advantage: where nothing is left to learn, or the
+    bonus weighs nothing, there is no signal.
+    """
+
+    STATE = ("alignments", "alignment_weight")
+
+    def __init__(self, config: MetaConfig) -> None:
+        self.horizon, self.bound = config.horizon, config.max_credit
+        self.pending: list[PendingCredit] = []
+        self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
+
+    def judge(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+        """The credit of the β that has now been judged to the end; arguments as in `learn`."""
+        self.credit_all(gradient, strength)
+        done = self.pending and self.pending[0].updates == self.horizon
+        first = self.pending.pop(0) if done else None
+        length = math.sqrt(dot(effect.direction, effect.direction))
+        direction = effect.direction / np.float32(length) if length > 0 else effect.direction
+        self.pending.append(PendingCredit(direction, min(1.0, effect.advantage_rms)))
+        return None if first is None else self.bounded(first.credit)
+
+    def credit_all(self, gradient: np.ndarray, strength: float) -> None:
+        """Add one term to the credit of every β under judgement, in units of its usual size.
+
+        That is a running root mean square, in which each update counts as one.
+        """
+        for item in self.pending:
+            item.updates += 1
+        if not (self.pending and strength > 0):
+            return
+        along = [dot(gradient, item.direction) / strength for item in self.pending]
+        squares = sum(value * value for value in along) / len(along)
+        self.alignments = SCALE_DECAY * self.alignments + squares
+        self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
+        usual = math.sqrt(self.alignments / self.alignment_weight)
+        if usual > 0:
+            for item, value in zip(self.pending, along, strict=True):
+                item.credit += value / usual * min(1.0, strength) * item.strength
+
+    def bounded(self, credit: float) -> float:
+        """A sum of `horizon` terms as one whose noise has size 1, within `max_credit`."""
+        return min(max(credit / math.sqrt(self.horizon), -self.bound), self.bound)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Stateful`."""
+        return super().state_dict() | {"pending": [saved(vars(item)) for item in self.pending]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `Stateful`."""
+        super().load_state_dict(state)
+        self.pending = [PendingCredit(**restored(None, item)) for item in state["pending"]]
+
+
+class Integrator(Stateful):
+    """Adds up n credits c, and moves β's logit once they say more than chance would.
+
+    z = Σc / √max(Σc², N / 2) is the sum in units of its noise, N the number of credits that the
+    whole training will have. At the end it is about standard normal if β changed nothing; earlier
+    it is smaller, so that β does not wander. Below the threshold the logit stays; beyond it
+    follows z.
+    """
+
+    STATE = ("count", "expected", "sum", "squares")
+
+    def __init__(self, config: MetaConfig) -> None:
+        self.gain, self.threshold = config.credit_gain, config.credit_threshold
+        self.count, self.expected, self.sum, self.squares = 0, 0.0, 0.0, 0.0
+
+    def add(self, credit: float, progress: float) -> None:
+        """Take in one more credit; progress: the share of the training that is over, above 0."""
+        self.count += 1
+        self.expected = self.count / progress
+        self.sum += credit
+        self.squares += credit * credit
+
+    @property
+    def logit(self) -> float:
+        """What the credits add to the logit of β."""
+        if self.count == 0:
+            return 0.0
+        z = self.sum / math.sqrt(max(self.squares, self.expected / 2))
+        return math.copysign(self.gain * max(abs(z) - self.threshold, 0.0), z)

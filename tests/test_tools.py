@@ -1,0 +1,209 @@
+"""tools/ and benchmarks/: kept tables, random returns, the archive for a DOI, what is measured."""
+
+import importlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from shared import ROOT, Bonanza, message
+
+from benchmarks import breakdown, purejaxrl
+from benchmarks.measuring import CARTPOLE, HOPPER
+from mace_rl.runs import run
+from mace_rl.study.config import read_study
+from tools import kept_runs, random_return
+from tools.deposit import DepositError, deposit
+
+
+@pytest.mark.slow
+def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
+    for name in ("workflow", "profiles", "config"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("Snakefile", "config.yaml"):
+        shutil.copy(ROOT / name, tmp_path)
+    small = {"environments": ["CartPole-v1"], "variants": ["ppo"], "seeds": [0, 1]}
+    small |= {"training": {"episodes": 60}, "metrics": {"comparisons": []}}
+    (tmp_path / "config/small.yaml").write_text(yaml.safe_dump(small))
+    study = read_study([tmp_path / "config.yaml", tmp_path / "config/small.yaml"])
+    for seed in (0, 1):
+        folder = tmp_path / f"results/runs/CartPole-v1/ppo/seed{seed}"
+        run.run(study.run_config("CartPole-v1", "ppo", seed), folder)
+    kept_runs.pack(tmp_path / "results", tmp_path / "reference/study")
+    wanted = {"configuration": "config", "configfiles": ["config/small.yaml"], "config": []}
+    wanted["outputs"] = ["metrics.csv", "figure1.png"]
+    studies, kept = tmp_path / "reference/studies.yaml", tmp_path / "reference/tables/small"
+    studies.write_text(yaml.safe_dump({"small": wanted}))
+
+    def tabulate(*words: str) -> tuple[str, str]:
+        script = "from pathlib import Path; from tools import tables; "
+        script += f"tables.ROOT = Path({str(tmp_path)!r}); tables.main()"
+        command = [sys.executable, "-c", script, *words]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+        assert (done.returncode == 1) == ("tables: " in done.stderr), done.stderr
+        return done.stdout, done.stderr.strip()
+
+    stale = tmp_path / "results/tables/small/stale"
+    stale.parent.mkdir(parents=True)
+    stale.touch()
+    names = ("metrics.csv", "figure1.png", "README.md")
+    made = "3 tables and figures of 1 studies from 2 runs, in results/tables\n"
+    new = "".join(f"new: reference/tables/small/{name}\n" for name in names)
+    assert tabulate() == (new + made, "") and not stale.exists()
+    readme = (kept / "README.md").read_text()
+    assert readme.startswith("# small\n") and readme.count("![") == 1
+    assert "![figure1](figure1.png)" in readme and "## Mean return of training" in readme
+
+    metrics = (kept / "metrics.csv").read_bytes()
+    (kept / "metrics.csv").write_bytes(metrics + b"\n")
+    (kept / "README.md").unlink()
+    named = "tables: not those that are kept: "
+    named += "reference/tables/small/metrics.csv, reference/tables/small/README.md"
+    assert tabulate("--check") == (made, named)
+    (kept / "metrics.csv").write_bytes(metrics)
+    (kept / "README.md").write_text("stale")
+    assert tabulate() == ("renewed: reference/tables/small/README.md\n" + made, "")
+    assert (kept / "README.md").read_text() == readme
+
+    studies.write_text(yaml.safe_dump({"small": wanted, "bad": wanted | {"config": ["seeds=[2]"]}}))
+    output, error = tabulate()
+    assert "tables: bad: " in error and "seed2/run.json" in error and not output
+    assert tabulate("--report", "small")[0] == "results/tables/small/report.html\n"
+    assert "<!DOCTYPE html>" in (tmp_path / "results/tables/small/report.html").read_text()
+    assert "--report is 'none', but should be one of bad, small" in tabulate("--report", "none")[1]
+
+
+# --- random_return --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["CartPole-v9", "3"], "environment has 'CartPole-v9', which is not in Gymnasium's"),
+        (["nope:Foo-v0", "3"], "in the settings of nope:Foo-v0 and"),
+        (["CliffWalking-v1", "3"], "environment has 'CliffWalking-v1', which has no time limit"),
+        (["CartPole-v1", "3", "no.yaml"], "no.yaml: cannot be read: "),
+        (["CartPole-v1", "3", "maps.yaml"], "CartPole-v1 cannot be made: "),
+        (["CartPole-v1", "1"], "EPISODES is 1, but should be at least 2"),
+    ],
+)
+def test_what_has_no_random_return(monkeypatch, tmp_path, words, expected) -> None:
+    monkeypatch.chdir(tmp_path)
+    maps = "environment_settings: {CartPole-v1: {environment_arguments: {map_name: 4x4}}}\n"
+    (tmp_path / "maps.yaml").write_text(maps)
+    said = message(monkeypatch, random_return, "--", *words)
+    assert said.startswith(f"random_return: {expected}")
+
+
+def test_a_random_return_is_that_of_random_actions(monkeypatch, capsys, register, tmp_path) -> None:
+    """Of so many fair choices between 0 and 1 in each of 40 episodes."""
+    name, short = register("Bonanza-v0", Bonanza, 1000), tmp_path / "short.yaml"
+    short.write_text(f"environment_settings: {{{name}: {{max_episode_steps: 100}}}}\n")
+    for steps, files in ((1000, []), (100, [str(short)])):
+        monkeypatch.setattr("sys.argv", ["random_return", name, "40", *files])
+        random_return.main()
+        words = capsys.readouterr().out.replace(":", "").replace(")", "").split()
+        error = (steps / 4 / 40) ** 0.5
+        assert words[0] == name and float(words[1]) == pytest.approx(steps / 2, abs=4 * error)
+        assert float(words[-1]) == pytest.approx(error, rel=0.4)
+
+
+# --- deposit --------------------------------------------------------------------------------------
+
+of_a_clone = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="only a clone is deposited")
+
+
+def printed(*command: str | Path, cwd: Path) -> str:
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    printed("git", "clone", "-q", ROOT, tmp_path / "clone", cwd=tmp_path)
+    return tmp_path / "clone"
+
+
+@of_a_clone
+@pytest.mark.slow
+def test_the_archive_is_the_commit_and_its_checksums_hold(clone, tmp_path):
+    name, data = deposit(clone)
+    (tmp_path / name).write_bytes(data)
+    printed("tar", "-xf", name, cwd=tmp_path)
+    folder = tmp_path / name.removesuffix(".tar")
+    printed("sha256sum", "--check", "--quiet", "--strict", "SHA256SUMS", cwd=folder)
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    tracked = printed("git", "ls-files", "-z", cwd=clone).split("\0")[:-1]
+    assert files == {*tracked, "SHA256SUMS"}
+    assert {"environment.lock", "LICENSE", "reference/README.md"} <= files
+    assert all((folder / path).read_bytes() == (clone / path).read_bytes() for path in tracked)
+    assert (folder / ".ci/run").stat().st_mode & 0o111
+    assert (folder / "src/mace_rl/config/defaults.yaml").is_symlink()
+    with (tmp_path / name).open("rb") as file:
+        said = subprocess.run(["git", "get-tar-commit-id"], stdin=file, capture_output=True)
+    assert said.stdout.decode() == printed("git", "rev-parse", "HEAD", cwd=clone)
+
+
+@of_a_clone
+@pytest.mark.slow
+def test_equal_bytes_again_from_another_clone(clone, tmp_path):
+    printed("git", "clone", "-q", clone, tmp_path / "a second clöne", cwd=tmp_path)
+    for path in (tmp_path / "a second clöne").rglob("*.py"):
+        path.touch()
+        path.chmod(0o600)
+    assert deposit(tmp_path / "a second clöne") == deposit(clone) == deposit(clone)
+
+
+@of_a_clone
+@pytest.mark.slow
+@pytest.mark.parametrize("change", ["README.md", "a new file"])
+def test_what_is_not_committed_is_refused(clone, change):
+    (clone / change).write_text("changed")
+    with pytest.raises(DepositError, match=rf"^not committed: .*{change}\W*$"):
+        deposit(clone)
+
+
+# --- benchmarks -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", [CARTPOLE, HOPPER])
+@pytest.mark.parametrize("variant", ["ppo", "mace_full"])
+def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, environment, variant):
+    from mace_rl.trainer import Trainer
+
+    for _, module, name in breakdown.FUNCTIONS:  # put back after the test
+        owner = importlib.import_module(module)
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+    known = {} if variant == "ppo" else {"novelty": {"refresh_every": 8, "write_every": 1}}
+    config = run_config(environment, variant, episodes=12, **known)
+    plain, profiled = Trainer(config), Trainer(config)
+    assert len(list(plain.run())) == 12
+    watch = breakdown.Stopwatch("bookkeeping")
+    breakdown.instrument(profiled, watch)
+    assert len(list(profiled.run())) == 12
+    assert profiled.records == plain.records
+    expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
+    assert watch.stop().keys() == expected.keys()
+
+
+def test_purejaxrl_s_training_imports_nothing_but_what_its_environment_has():
+    script = Path(purejaxrl.__file__).with_name("purejaxrl_training.py")
+    command = [sys.executable, "-I", "-S", str(script), "folder", "{}", "0"]
+    said = subprocess.run(command, capture_output=True, text=True).stderr
+    assert said.splitlines()[-1] == "ModuleNotFoundError: No module named 'jax'"
+
+
+@pytest.mark.slow
+def test_purejaxrl_trains():
+    """For real: in its environment, which is made first (800 MB), two updates of its own size."""
+    try:
+        purejaxrl.set_up()
+    except purejaxrl.LeftOut as reason:
+        pytest.skip(str(reason))  # where neither GitHub nor a clone, or no index, can be reached
+    given = purejaxrl.configuration("purejaxrl_4x128", CARTPOLE, 2 * 4 * 128)
+    reading = purejaxrl.train(given, seed=0)
+    assert reading["steps"] == 1024
+    assert 0 < reading["cpu_seconds"] < 60 and reading["seconds"] > 0
+    assert reading["note"].startswith("jax 0.10.2, jaxlib 0.10.2, flax ")

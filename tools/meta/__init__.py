@@ -1,0 +1,1 @@
+"""The making of the meta network's weights: `python -m tools.meta --help`."""

@@ -1,0 +1,28 @@
+"""The ledger: what of the paper holds, and what of our own questions (docs/protocol.md)."""
+
+from pathlib import Path
+
+from job import job
+
+from mace_rl.files import write_atomically
+from mace_rl.records import read_table
+from mace_rl.runs.provenance import read_record
+from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.compare import ledger, verdicts
+from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import markdown, sections
+
+with job(snakemake):
+    found, given = snakemake.input, snakemake.params
+    settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
+    runs = read_metrics(found.metrics, given.runs, settings)
+    betas = read_table(found.betas, betas_columns(settings))
+    runs = runs.merge(betas, how="left", validate="1:1")
+    answers = verdicts.ledger(runs, settings, paper)
+    hours = sum(read_record(Path(record))["seconds"] for record in found.records) / 3600
+    cost = {"command": given.command, "runs": len(runs), "core_hours": hours}
+    write_atomically(snakemake.output.json, ledger.to_json(cost, answers))
+    origin = f"`{given.command}`: {len(runs)} runs, {hours:.1f} core-hours."
+    page = markdown.page("Does it hold?", origin, sections.of_ledger(answers, paper))
+    write_atomically(snakemake.output.markdown, page)

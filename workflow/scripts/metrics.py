@@ -1,0 +1,14 @@
+"""metrics.csv and betas.csv: what is measured on each run."""
+
+from job import job
+
+from mace_rl.files import write_atomically
+from mace_rl.runs.finished import read_runs
+from mace_rl.study.measure.run_metrics import betas_table, metrics_table
+from mace_rl.study.metrics_config import MetricsConfig
+
+with job(snakemake):
+    settings = MetricsConfig.model_validate(snakemake.params.settings)
+    runs = read_runs(snakemake.input.records, snakemake.params.runs)
+    for path, table in zip(snakemake.output, (metrics_table, betas_table), strict=True):
+        write_atomically(path, table(runs, settings).to_csv(index=False))

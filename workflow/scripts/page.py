@@ -1,0 +1,24 @@
+"""The report: one page of everything."""
+
+from pathlib import Path
+
+from job import job
+
+from mace_rl.config.agent import PPOConfig
+from mace_rl.files import write_atomically
+from mace_rl.runs.provenance import read_record
+from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import animations, curves, report, sections
+
+with job(snakemake):
+    found, given, output = snakemake.input, snakemake.params, Path(snakemake.output[0])
+    settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
+    data, answers = sections.read_data(dict(found.items()), given.runs, settings)
+    ppo = {env: PPOConfig.model_validate(own) for env, own in given.ppo.items()}
+    records = [read_record(Path(record)) for record in found.records]
+    made = report.Provenance(given.command, given.configuration, ppo, records)
+    runs = animations.first_seeds(given.runs, found.records)
+    films = animations.animations(runs, given.style["labels"], output.parent, given.own)
+    style = curves.plot_style(settings, **given.style)
+    write_atomically(output, report.page(data, answers, paper, made, films, settings, style))

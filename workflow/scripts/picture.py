@@ -1,0 +1,20 @@
+"""A picture of all runs at once, or of the ledger, and its data."""
+
+from job import job
+
+from mace_rl.files import write_atomically
+from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import curves, pictures
+from mace_rl.study.show.sections import read_data
+
+with job(snakemake):
+    given, output = snakemake.params, snakemake.output
+    settings = MetricsConfig.model_validate(given.settings)
+    data = read_data(dict(snakemake.input.items()), given.runs, settings)
+    source = pictures.Source(*data, settings, parse_claims(snakemake.input.claims))
+    picture = pictures.PICTURES[snakemake.wildcards.picture]
+    table = picture.data(source)
+    write_atomically(output.data, table.to_csv(index=False))
+    figure = picture.draw(table, curves.plot_style(settings, **given.style))
+    curves.save_figure(figure, output.pdf, output.png)

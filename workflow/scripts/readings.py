@@ -1,0 +1,19 @@
+"""The picture of Table 1 under every reading of its metrics, and its data."""
+
+from job import job
+
+from mace_rl.files import write_atomically
+from mace_rl.runs.finished import read_runs
+from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.compare.readings import readings
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import curves, pictures
+
+with job(snakemake):
+    found, given, output = snakemake.input, snakemake.params, snakemake.output
+    settings = MetricsConfig.model_validate(given.settings)
+    runs = read_runs(found.records, given.runs)
+    table = readings(runs, settings, parse_claims(found.claims).table1)
+    write_atomically(output.data, table.to_csv(index=False))
+    figure = pictures.draw_readings(table, curves.plot_style(settings, **given.style))
+    curves.save_figure(figure, output.png, output.pdf)  # the first layout differs a little

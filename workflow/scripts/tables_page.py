@@ -1,0 +1,17 @@
+"""tables.md: every table of the study on one page, for reading beside its pictures."""
+
+from job import job
+
+from mace_rl.files import write_atomically
+from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.show import markdown, sections
+
+with job(snakemake):
+    given, paper = snakemake.params, parse_claims(snakemake.input.claims)
+    settings = MetricsConfig.model_validate(given.settings)
+    data, answers = sections.read_data(dict(snakemake.input.items()), given.runs, settings)
+    shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings, {})]
+    origin = f"`{given.command}`: {len(given.runs)} runs."
+    page = markdown.page("The tables of this study", origin, shown, given.pictures)
+    write_atomically(snakemake.output[0], page)
