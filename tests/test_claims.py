@@ -68,7 +68,6 @@ def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
         (2, 20, WORST, 0.02, BUT_C6, "reversed"),
         (2, 20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),
         (2, 12, SMALL, 0.3, BUT_C6, "open"),
-        (2, 1, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
     ],
 )
 def test_verdicts_where_the_truth_is_known(
@@ -283,17 +282,8 @@ def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> 
     part, needed = answers["C8"][LITERAL].parts[0], runs["sample_efficiency"]  # episodes, together
     shares = [needed[env, "ppo"].mean() / budget for env, budget in EPISODES.items()]
     assert part.worth_mentioning == pytest.approx(np.mean(shares) / 10)
-    floors = [1 / budget for budget in EPISODES.values()]
-    assert part.room == pytest.approx(np.mean(shares) - np.mean(floors))
+    assert part.room == pytest.approx(np.mean(shares) - np.mean([1 / e for e in EPISODES.values()]))
     assert answers["C9"][ROBUST].parts[0].room == 1
-
-
-def test_nineteen_of_twenty_means_lie_where_one_run_predicts_them() -> None:
-    draws, inside = np.random.default_rng(2), []
-    for _ in range(4000):
-        ours, theirs = draws.normal(3, 2, 12), draws.normal(3, 2)
-        inside.append(abs(ours.mean() - theirs) < direction_and_size.by_chance(ours))
-    assert np.mean(inside) == pytest.approx(0.95, abs=0.012)
 
 
 # The file of what a paper says.

@@ -245,14 +245,7 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
 
 @pytest.mark.parametrize(
     ("name", "family"),
-    [
-        ("every_seed", 0),
-        ("constants", 0),
-        ("solved", 0),
-        ("forest", 0),
-        ("forest", 1),
-        ("forest", 2),
-    ],
+    [("every_seed", 0), ("constants", 0), ("solved", 0), *(("forest", i) for i in range(3))],
 )
 def test_every_picture_is_the_same_again(runs, ledgers, settings, study, tmp_path, name, family):
     source = Source({"metrics": runs}, ledgers[family], settings, CLAIMS)

@@ -311,7 +311,6 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     by_size = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, BY_SIZE)
     shown = markdown_page("", "", of_ledger(by_size, BY_SIZE))
     assert "10 not reproduced, 0 open, 0 could not be asked" in shown and "docs/metrics.md" in shown
-    assert "| detectable | room | one seed | replication | size |  |" in shown
     part = by_size[0].ways[ROBUST].parts[0]
     ends = " to ".join(number(end) for end in (part.predicted_low, part.predicted_high))
     assert f"| {number(part.room)} | {ends} | {part.replication} | small | absent |" in shown
