@@ -354,7 +354,9 @@ def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
     """The value of one setting, for each group of environments that share it."""
     environments: dict[str, list[str]] = {}
     for environment, config in ppo.items():
-        environments.setdefault(_value(getattr(config, name)), []).append(environment)
+        value = getattr(config, name)
+        text = "none" if value is None and name == "max_gradient_norm" else _value(value)
+        environments.setdefault(text, []).append(environment)
     if len(environments) == 1:
         return next(iter(environments))
     values = [Value(f"{value} ({', '.join(whose)})") for value, whose in environments.items()]
