@@ -19,18 +19,19 @@ class Settings(Section):
 
 
 class StopWhenUnlearnable(Stateful, BetaController):
-    """β is 1; if the bonus of the second window is above a share of the first's, it is 0 from then.
+    """β is 1, and 0 for good once a window's bonus is above a share of the first window's.
 
-    What can be learned fades; a bonus that does not comes of noise. Raises `ConfigError` for
-    arguments that are not as `Settings` has them.
+    It asks from the end of the second window on. What can be learned fades by then; a bonus that
+    does not comes of noise. Raises `ConfigError` for arguments that are not as `Settings` has them.
     """
 
-    STATE = ("_beta", "means")
+    STATE = ("_beta", "first", "last")
 
     def __init__(self, generator: np.random.Generator, **arguments: Any) -> None:
         self.settings = check(Settings, arguments, "arguments")
         self._beta = 1.0
-        self.means: list[float] = []  # of the bonus of each episode of the two windows
+        self.first: list[float] = []  # of the episodes of the first window, their mean bonus
+        self.last: list[float] = []  # of those since, a window of them at most
 
     @property
     def beta(self) -> float:
@@ -40,9 +41,9 @@ class StopWhenUnlearnable(Stateful, BetaController):
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         window = self.settings.window
-        if len(self.means) == 2 * window:
+        if len(self.first) < window:
+            self.first.append(float(bonus.mean()))
             return
-        self.means.append(float(bonus.mean()))
-        if len(self.means) == 2 * window:
-            first, second = sum(self.means[:window]), sum(self.means[window:])
-            self._beta = float(second <= self.settings.share * first)
+        self.last = [*self.last, float(bonus.mean())][-window:]
+        if len(self.last) == window and sum(self.last) > self.settings.share * sum(self.first):
+            self._beta = 0.0

@@ -30,6 +30,9 @@ CLAIMS = read_claims(STUDY, ROOT / STUDY.claims)
 FAMILIES = CLAIMS.families.items()
 PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict([one])}) for one in FAMILIES)
 LITERAL, ROBUST = CLAIMS.ways
+by_rule = PAPERS.model_dump() | {"rule": 2}
+by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be asked"
+BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
 QUESTIONED = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})

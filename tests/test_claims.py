@@ -1,6 +1,7 @@
 """The verdicts of the protocol's rule, from tables in which the truth is known."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 from invented import (
+    BY_SIZE,
     CLAIMS,
     EPISODES,
     LITERAL,
@@ -24,9 +26,9 @@ from shared import refused
 
 from mace_rl.config.section import ConfigError
 from mace_rl.records import RecordError
-from mace_rl.study.claims_config import parts_of, read_claims
-from mace_rl.study.compare import verdicts
-from mace_rl.study.compare.ledger import Finding, read_ledger, to_json
+from mace_rl.study.claims_config import ClaimsConfig, parts_of, read_claims
+from mace_rl.study.compare import direction_and_size, verdicts
+from mace_rl.study.compare.ledger import Finding, SizedFinding, read_ledger, to_json
 from mace_rl.study.config import Study
 from mace_rl.study.measure.metrics import CORRELATION
 
@@ -48,24 +50,32 @@ def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
 
 
 @pytest.mark.parametrize(
-    ("seeds", "advantage", "noise", "which", "expected"),
+    ("rule", "seeds", "advantage", "noise", "which", "expected"),
     [
-        (20, PLAIN, 0.02, BUT_C6, "reproduced"),
-        (20, PLAIN, 0.02, ["C6"], "not reproduced"),  # it is before PPO, not before the learned
-        (20, FIXED, 0.02, ["C6", "C9"], "reproduced"),
-        (20, FIXED, 0.02, OF_FULL, "not reproduced"),
-        (20, WORST, 0.02, BUT_C6, "reversed"),
-        (20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),  # nothing worth mentioning
-        (20, SLIGHT, 0.005, [*BUT_C6, "C6"], "not reproduced"),  # beyond chance, and too small
-        (12, VAST, 1.0, BUT_C6, "open"),  # what seeds cannot tell apart
-        (9, EQUAL, 0.0, [*BUT_C6, "C6"], "open"),  # too few decide nothing
-        (9, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
-        (1, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
+        (1, 20, PLAIN, 0.02, BUT_C6, "reproduced"),
+        (1, 20, PLAIN, 0.02, ["C6"], "not reproduced"),  # it is before PPO, not before the learned
+        (1, 20, FIXED, 0.02, ["C6", "C9"], "reproduced"),
+        (1, 20, FIXED, 0.02, OF_FULL, "not reproduced"),
+        (1, 20, WORST, 0.02, BUT_C6, "reversed"),
+        (1, 20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),  # nothing worth mentioning
+        (1, 20, SLIGHT, 0.005, [*BUT_C6, "C6"], "not reproduced"),  # beyond chance, and too small
+        (1, 12, VAST, 1.0, BUT_C6, "open"),  # what seeds cannot tell apart
+        (1, 9, EQUAL, 0.0, [*BUT_C6, "C6"], "open"),  # too few decide nothing
+        (1, 9, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
+        (1, 1, PLAIN, 0.02, [*BUT_C6, "C6"], "open"),
+        (2, 20, PLAIN, 0.02, BUT_C6, "reproduced"),
+        (2, 20, SLIGHT, 0.005, BUT_C6, "reproduced"),  # small and certain
+        (2, 20, WORST, 0.02, BUT_C6, "reversed"),
+        (2, 20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),
+        (2, 12, SMALL, 0.3, BUT_C6, "open"),
     ],
 )
-def test_verdicts_where_the_truth_is_known(study, seeds, advantage, noise, which, expected) -> None:
+def test_verdicts_where_the_truth_is_known(
+    study, rule, seeds, advantage, noise, which, expected
+) -> None:
     settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), settings, PAPERS)
+    claims = {1: PAPERS, 2: BY_SIZE}[rule]
+    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), settings, claims)
     found = {one.claim: {judged.verdict for judged in one.ways.values()} for one in answers}
     assert {name: found[name] for name in which} == {name: {expected} for name in which}
 
@@ -194,11 +204,86 @@ def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds
     assert all(list(answer.ways) == [ROBUST] for answer in found)
 
 
-def test_the_ledger_is_read_as_it_was_written(tmp_path: Path) -> None:
-    answers = verdicts.ledger(table_for_claims(1, PLAIN, 0.1), STUDY.metrics, PAPERS)  # with NaN
+@pytest.mark.parametrize("claims", [PAPERS, BY_SIZE])
+def test_the_ledger_is_read_as_it_was_written(tmp_path: Path, claims: ClaimsConfig) -> None:
+    answers = verdicts.ledger(table_for_claims(1, PLAIN, 0.1), STUDY.metrics, claims)  # with NaN
     path = tmp_path / "claims.json"
     path.write_text(to_json({"runs": 9}, answers), encoding="utf-8")
     assert repr(read_ledger(path)) == repr(answers)
+
+
+# The second rule: docs/metrics.md.
+
+
+@pytest.mark.parametrize(
+    ("interval", "p_holm", "p_equivalent_holm", "expected", "changes"),
+    [
+        ((1, 4), 0.049, 0.001, ("shown", "small"), {}),  # not outranked by an absence
+        ((6, 9), 0.049, 0.9, ("shown", "worth mentioning"), {}),
+        ((3, 8), 0.049, 0.9, ("shown", "open"), {}),
+        ((-9, -6), 0.049, 0.9, ("reversed", "worth mentioning"), {}),
+        ((-3, 4), 0.05, 0.049, ("absent", "small"), {}),
+        ((-3, 4), 0.05, 0.05, ("open", "small"), {}),
+        ((-3, 5), 0.9, 0.001, ("open", "open"), {}),  # the interval reaches the margin
+        ((-3, 4), 0.9, 0.001, ("absent", "small"), {"room": 5.0}),
+        ((-3, 4), 0.9, 0.001, ("no_room", "small"), {"room": 4.99}),
+        ((1, 4), 0.049, 0.001, ("shown", "small"), {"room": 4.0}),
+        ((6, 9), 0.001, 0.001, ("open", "open"), {"seeds": 9, "room": 1.0}),
+    ],
+)
+def test_a_part_has_direction_and_size(interval, p_holm, p_equivalent_holm, expected, changes):
+    """The margin is 5, and p values that are not corrected say nothing."""
+    finding = SizedFinding(
+        *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", 10, np.mean(interval)),
+        *(*interval, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001, p_holm, p_equivalent_holm),
+        room=99.0,
+    )
+    found = direction_and_size.decided(replace(finding, **changes))
+    assert (found.outcome, found.size, found.replication) == (*expected, "")
+
+
+def test_what_could_not_improve_could_not_be_asked(study: Study) -> None:
+    """Acrobot's PPO needs 60 episodes of a possible 50, and ends where the best run does."""
+    frame = table_for_claims(12, EQUAL, noise=0.02)
+    draws, acrobot = np.random.default_rng(5), frame["env"] == "Acrobot-v1"
+    frame.loc[acrobot, "sample_efficiency_common"] = draws.integers(58, 63, acrobot.sum())
+    frame.loc[acrobot, "final_return"] = draws.normal(-86, 1, acrobot.sum())
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    answers = verdicts.ledger(frame, settings, BY_SIZE)
+    judged = {one.claim: one.ways[ROBUST] for one in answers}
+    assert (judged["C1"].outcome, judged["C1"].verdict) == ("no_room", "could not be asked")
+    assert [part.outcome for part in judged["C7"].parts] == ["no_room"] * 2 + ["absent"] * 2
+    assert judged["C7"].verdict == "not reproduced"  # for Hopper's sake
+    frame.loc[~acrobot, "final_return"] = draws.normal(900, 900, (~acrobot).sum())
+    judged = {one.claim: one for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    assert judged["C7"].ways[ROBUST].verdict == "open"
+
+
+def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> None:
+    frame = table_for_claims(12, SMALL, noise=0.1)
+    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+    answers = {one.claim: one.ways for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    runs = frame.set_index(["env", "variant", "seed"]).sort_index()
+    efficiency = runs.loc["Acrobot-v1", "sample_efficiency_common"]
+    (part, _), mean = answers["C1"][ROBUST].parts, efficiency["ppo"].mean()
+    assert (part.worth_mentioning, part.room) == pytest.approx((mean / 10, mean - 50))
+    gain = efficiency["ppo"] - efficiency["mace_full"]
+    chance = scipy.stats.t.interval(0.95, 11, -63, gain.std() * (13 / 12) ** 0.5)
+    assert (part.predicted_low, part.predicted_high) == pytest.approx(chance)
+    assert part.low > -63 and chance[0] < part.difference < chance[1]
+    assert part.replication == "within one seed's chance"
+    for changed, said in (("in_paper", "agrees"), ("predicted_low", "disagrees")):
+        one = replace(part, **{changed: part.difference + (changed != "in_paper")})
+        assert direction_and_size.decided(one).replication == said
+    best = max(-85.0, runs.loc["Acrobot-v1", "final_return"].max())
+    part = answers["C7"][ROBUST].parts[0]
+    assert part.room == pytest.approx(best - runs.loc[("Acrobot-v1", "ppo"), "final_return"].mean())
+    assert (part.worth_mentioning, part.replication) == (pytest.approx(414.1 / 20), "")
+    part, needed = answers["C8"][LITERAL].parts[0], runs["sample_efficiency"]  # episodes, together
+    shares = [needed[env, "ppo"].mean() / budget for env, budget in EPISODES.items()]
+    assert part.worth_mentioning == pytest.approx(np.mean(shares) / 10)
+    assert part.room == pytest.approx(np.mean(shares) - np.mean([1 / e for e in EPISODES.values()]))
+    assert answers["C9"][ROBUST].parts[0].room == 1
 
 
 # The file of what a paper says.
@@ -216,6 +301,9 @@ MISTAKES = [  # one text for another, and what is said of it
     ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
     ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
     ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),
+    ("report: #", "rule: 3\nreport: #", ["rule is 3", "1 or 2"]),
+    ("report: #", "rule: 2\nreport: #", ["claims.words.no_room is None", "rule is 2"]),
+    ("shown: reproduced", "no_room: x, shown: y", ["words.no_room is 'x'", "rule is 1"]),
 ]
 
 

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 from invented import (
+    BY_SIZE,
     CLAIMS,
     QUESTIONED,
     SEEDS,
@@ -180,8 +181,9 @@ def runs() -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def ledgers() -> list[list[Answer]]:
     advantage = {"ppo": 0.0, "mace_fixed": 0.03, "mace_full": 0.06}
-    tables = table_for_claims(12, advantage, 0.05), table_for_questions(12)
-    return [ledger(table, QUESTIONED, CLAIMS) for table in tables]
+    claimed, asked = table_for_claims(12, advantage, 0.05), table_for_questions(12)
+    own = (claimed, CLAIMS), (asked, CLAIMS), (claimed, BY_SIZE)
+    return [ledger(table, QUESTIONED, claims) for table, claims in own]
 
 
 @pytest.fixture
@@ -224,11 +226,12 @@ def test_a_seed_solves_its_task_if_nine_of_ten_last_episodes_do(runs, settings) 
         assert (row.solved, row.seeds) == (sum(share >= 0.9 for share in own), len(own))
 
 
-@pytest.mark.parametrize("family", [0, 1])
+@pytest.mark.parametrize("family", [0, 1, 2])
 def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, settings) -> None:
     ledger = ledgers[family]
     table = PICTURES["forest"].data(Source({}, ledger, settings, CLAIMS))
     assert set(table["measured"]) == set(ledger[0].ways)
+    assert ("size" in table) == (family == 2)
     for how, rows in table.groupby("measured"):
         parts = [(one.ways[how], part) for one in ledger for part in one.ways[how].parts]
         for (judged, part), (_, row) in zip(parts, rows.iterrows(), strict=True):
@@ -242,7 +245,7 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
 
 @pytest.mark.parametrize(
     ("name", "family"),
-    [("every_seed", 0), ("constants", 0), ("solved", 0), ("forest", 0), ("forest", 1)],
+    [("every_seed", 0), ("constants", 0), ("solved", 0), *(("forest", i) for i in range(3))],
 )
 def test_every_picture_is_the_same_again(runs, ledgers, settings, study, tmp_path, name, family):
     source = Source({"metrics": runs}, ledgers[family], settings, CLAIMS)

@@ -179,6 +179,48 @@ def test_stagnation_goes_with_the_beta_of_the_next_episode():
     assert m.stagnation_correlation(returns, np.full(300, 0.4), window) == 0
 
 
+def by_hand(returns, betas, window, episodes):
+    """Stagnation after each of these episodes, over halves of what there is, with the next β."""
+    pairs = []
+    for episode in episodes:
+        h = min(window, episode // 2)
+        before, last = returns[episode - 2 * h : episode][:h], returns[episode - h : episode]
+        pairs.append([round((np.mean(before) - np.mean(last)) / h, 9), betas[episode]])
+    return pd.DataFrame(pairs).corr(method="spearman").iloc[0, 1]
+
+
+@pytest.mark.parametrize("window", [10, 25])
+def test_stagnation_before_and_after_the_bar_from_the_first_windows_on(window):
+    returns = noisy(3)
+    betas = np.repeat(np.random.default_rng(1).random(100), 4)  # in steps
+
+    def found(betas, goal=100.0):
+        run = curve(returns[: len(betas)], random=0, goals=(goal,), moving_average=window)
+        return m.stagnation_correlations(run, betas)
+
+    reached = min(t for t, mean in averages(returns, window).items() if mean >= 75)
+    first = 2 * ((window + 9) // 10)
+    assert first + 20 < reached < 380
+    before = by_hand(returns, betas, window, range(first, reached))
+    after = by_hand(returns, betas, window, range(reached, 400))
+    assert found(betas) == pytest.approx((before, after)) and abs(before - after) > 0.01
+    # A bar never reached, one reached at the end, β that is constant before it, a short run.
+    whole = by_hand(returns, betas, window, range(first, 400))
+    assert found(betas, goal=1000.0) == pytest.approx((whole, 0))
+    assert found(betas[:reached]) == pytest.approx((before, 0))
+    assert found(np.where(np.arange(400) < reached, 0.4, betas)) == pytest.approx((0, after))
+    assert found(betas[:1]) == found(betas[:first]) == (0, 0)
+
+
+@pytest.mark.parametrize("metric", [one for one in m.METRICS if one.unit == "episodes"])
+def test_no_run_is_earlier_than_a_metric_can_be(metric):
+    """And one that is good from the beginning is as early, or once it has risen at all."""
+    at_once, risen = np.full(400, 500.0), np.array([-1e4, *[500.0] * 399])
+    curves = [noisy(seed) for seed in range(20)] + [at_once, risen]
+    found = [metric.function(curve(own, random=-1e4, goals=(500.0,))).number for own in curves]
+    assert 0 <= min(found) - metric.earliest(50, 400) <= 1
+
+
 # --- metrics.csv ----------------------------------------------------------------------------------
 
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
@@ -242,8 +284,11 @@ def test_betas_are_measured_like_returns(tmp_path):
         stagnation = (average.shift(50) - average).shift(1).round(9)  # ties
         expected = stagnation.corr(pd.Series(beta), method="spearman")
         assert correlation == pytest.approx(expected)
+    without = t.betas_table(found, CONFIG.model_copy(update={"reference_return": {}}))
+    pd.testing.assert_frame_equal(without, result.iloc[:, :-2])  # no bar, nothing before it
     result.to_csv(tmp_path / "betas.csv", index=False)
-    pd.testing.assert_frame_equal(read_table(tmp_path / "betas.csv", t.BETAS), result)
+    read = read_table(tmp_path / "betas.csv", t.betas_columns(CONFIG))
+    pd.testing.assert_frame_equal(read, result)
 
 
 def change(row, column, value):

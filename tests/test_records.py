@@ -59,7 +59,7 @@ DAMAGE = {  # what the file holds, and what the message must name
     "env_steps": (text([ROWS[0], ROWS[1].replace("30", "31")]), "line 3", "env_steps is 31"),
     "length": (text(["1,0,0,9.5,0.25,0.4,1"]), "line 2", "length is 0"),
     "intrinsic": (text([ROWS[0].replace("0.25", "-0.25")]), "line 2", "intrinsic_return is -0.25"),
-    "beta above": (text([ROWS[0].replace("0.4", "1.5")]), "line 2", "beta is 1.5"),
+    "beta above": (text([ROWS[0].replace("0.4", "10.5")]), "line 2", "beta is 10.5"),
     "terminated": (text([ROWS[0][:-1] + "2"]), "line 2", "terminated is 2"),
     "windows newlines": (text().replace("\n", "\r\n"), "line 1", "terminated"),
     "a NUL": (text([ROWS[0].replace("9.5", "9\0")]), "line 2", "extrinsic_return"),

@@ -220,7 +220,8 @@ FILES = sorted({path.name for path in (CONFIG.parent / "config").glob("*.yaml")}
 
 @pytest.mark.parametrize("name", FILES)
 def test_every_study_of_the_project_can_be_carried_out(name: str) -> None:
-    study = read_study([CONFIG, CONFIG.parent / "config" / name])
+    below = ["questions.yaml"] if name == "controls.yaml" else []
+    study = read_study([CONFIG, *(CONFIG.parent / "config" / one for one in (*below, name))])
     for run in study.runs():
         study.run_config(*run)
     study.metrics.within(study.environments, study.variants)

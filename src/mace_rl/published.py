@@ -27,6 +27,7 @@ from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.bonus.intrinsic import Bonus
+from mace_rl.config.beta import MetaBeta
 from mace_rl.config.published import PublishedConfig
 from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import Environment
@@ -285,14 +286,14 @@ class PublishedTrainer(Trainer):
     def _beta(self) -> float:
         """Of a schedule that is set after the first episode and each tenth on, or the first."""
         rule, done = self.config.beta, len(self.records)
-        if rule.kind == "meta":
-            reaches = self.settings.beta_reaches_reward and done
-            return self.controller.printed if reaches else rule.initial
+        if rule.kind == "constant":
+            return rule.value
         if rule.kind == "exponential":
             age = max(0, done - 1) // SCHEDULE_EVERY * SCHEDULE_EVERY
             return max(rule.floor, rule.initial * rule.decay**age)
-        assert rule.kind == "constant"
-        return rule.value
+        assert isinstance(rule, MetaBeta)  # `RunConfig` refuses others
+        reaches = self.settings.beta_reaches_reward and done
+        return self.controller.printed if reaches else rule.initial
 
     def appraise(self, episode: Episode) -> Experience:
         """The returns of the total reward; what is returned has the β that the network printed."""

@@ -9,7 +9,7 @@ from mace_rl.records import read_table
 from mace_rl.runs.provenance import read_record
 from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare import ledger, verdicts
-from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import markdown, sections
 
@@ -17,7 +17,8 @@ with job(snakemake):
     found, given = snakemake.input, snakemake.params
     settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
     runs = read_metrics(found.metrics, given.runs, settings)
-    runs = runs.merge(read_table(found.betas, BETAS), how="left", validate="1:1")
+    betas = read_table(found.betas, betas_columns(settings))
+    runs = runs.merge(betas, how="left", validate="1:1")
     answers = verdicts.ledger(runs, settings, paper)
     hours = sum(read_record(Path(record))["seconds"] for record in found.records) / 3600
     cost = {"command": given.command, "runs": len(runs), "core_hours": hours}

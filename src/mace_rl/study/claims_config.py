@@ -8,14 +8,14 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
-from mace_rl.study.measure.metrics import CORRELATION, METRICS, all_metrics
+from mace_rl.study.measure.metrics import CORRELATIONS, METRICS, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 
 if TYPE_CHECKING:  # imports Gymnasium, which tables do without
@@ -125,6 +125,7 @@ class WordsConfig(Section):
     reversed: str
     absent: str
     open: str
+    no_room: str | None = None  # by the second rule, and by no other
 
 
 class FamilyConfig(Section):
@@ -147,6 +148,7 @@ class ClaimsConfig(Section):
     table1: Table1Config
     table2: Table2Config = Field(default=Table2Config())
     ways: dict[str, str]  # to measure a claim, each with what the report says of it
+    rule: Literal[1, 2] = 1  # the protocol's, or direction and size apart (docs/metrics.md)
     families: dict[str, FamilyConfig] = Field(default={})
 
     def lacking(
@@ -156,7 +158,7 @@ class ClaimsConfig(Section):
 
         Parts of returns have their margin by `metrics.reference_return` of their environments.
         """
-        has = {*environments, *variants, *(one.name for one in all_metrics(settings)), CORRELATION}
+        has = {*environments, *variants, *CORRELATIONS}.union(m.name for m in all_metrics(settings))
         found = {}
         for title, family in self.families.items():
             parts = [part for _, part in parts_of(family)]
@@ -206,7 +208,7 @@ def _check_names(claims: ClaimsConfig, study: "Study") -> None:
     metrics = [metric.name for metric in (*METRICS, *measured)]
     own = {*study.environments, *study.environment_settings}
     known: dict[str, tuple[Iterable[str], str]] = {
-        "metric": ([*metrics, CORRELATION], "the metrics"),
+        "metric": ([*metrics, *CORRELATIONS], "the metrics"),
         "measured": ([metric.name for metric in measured], "what this study measures"),
         "variant": ([*claims.variants, *study.variant_settings], "variants and variant_settings"),
         "environment": ([*registered(), *own], "Gymnasium's registry"),
@@ -251,6 +253,11 @@ def _check_form(claims: ClaimsConfig) -> None:
                     f" table1.variants, and no other, should have {len(table1.metrics)} numbers"
                 )
     for title, family in claims.families.items():
+        if (claims.rule == 2) != (family.words.no_room is not None):
+            raise ConfigError(
+                f"families.{title}.words.no_room is {family.words.no_room!r}, but should be a word"
+                f" by the second rule and not be there by the first; rule is {claims.rule}"
+            )
         for name, claim in family.claims.items():
             key = f"families.{title}.claims.{name}"
             if name in seen:

@@ -35,6 +35,22 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class SizedFinding(Finding):
+    """The same by the second rule, direction and size apart; `outcome` may be no_room, too."""
+
+    size: str = ""  # worth mentioning, small or open
+    room: float = math.nan  # how much better than the baseline a run could be at most
+    predicted_low: float = math.nan  # of where a mean of ours may lie if the paper's one run each
+    predicted_high: float = math.nan  # differs by chance
+    replication: str = ""  # agrees, within one seed's chance, disagrees; empty without a number
+
+    @property
+    def has_room(self) -> bool:
+        """Whether there could be a difference worth mentioning."""
+        return self.room >= self.worth_mentioning
+
+
+@dataclass(frozen=True)
 class Judgement:
     """What came out of a claim, measured in one way."""
 
@@ -84,4 +100,5 @@ def _judgement(outcome: str, verdict: str, parts: list[dict[str, Any]]) -> Judge
         part["environments"] = tuple(part["environments"])
         missing = [key for key, value in part.items() if value is None and key != "baseline"]
         part |= dict.fromkeys(missing, math.nan)
-    return Judgement(outcome, verdict, [Finding(**part) for part in parts])
+    kind = SizedFinding if "size" in parts[0] else Finding
+    return Judgement(outcome, verdict, [kind(**part) for part in parts])

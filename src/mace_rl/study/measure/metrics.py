@@ -7,7 +7,7 @@ a metric in episodes counts with E and is flagged as censored: E is then a lower
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -23,7 +23,10 @@ PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 
-CORRELATION = "stagnation_correlation"  # of betas.csv, beside the metrics: `METRICS`
+# Of betas.csv, beside the metrics (`METRICS`): in all of training, before and after the common bar.
+CORRELATION = "stagnation_correlation"
+BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
+CORRELATIONS = CORRELATION, BEFORE, AFTER
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 
@@ -84,6 +87,8 @@ class Metric:
     unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
     function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
     needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
+    # Of the moving average's window and E, the first episode that it can be.
+    earliest: Callable[[int, int], int] = field(default=lambda window, _: 1, kw_only=True)
 
     @property
     def flag(self) -> str:
@@ -124,16 +129,48 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
     return (total[window:] - total[:-window]) / window**2
 
 
+def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
+    """`slope` from the first episodes on: while there are no 2 windows, of the halves there are.
+
+    After episode t the last h episodes are compared with the h before them, h being t / 2, rounded
+    down, and `window` at most. The first h is a tenth of `window`: single episodes side by side are
+    noise. Entry i belongs to episode 2 · ceil(window / 10) + i.
+    """
+    first = 2 * math.ceil(window / 10)
+    ends = range(first, min(2 * window, len(returns) + 1))
+    growing = [slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
+    return np.concatenate([*growing, slope(returns, window)])
+
+
 def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
     """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
 
     returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
     2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
     """
-    stagnation, following = -slope(returns, window)[:-1], betas[2 * window :]
-    if len(following) < 2 or np.ptp(stagnation) == 0 or np.ptp(following) == 0:
+    return _correlation(-slope(returns, window), betas)
+
+
+def stagnation_correlations(curve: LearningCurve, betas: np.ndarray) -> tuple[float, float]:
+    """The same before and after the run reaches the common bar, by the `growing_slope`.
+
+    betas: [E]. An episode's stagnation and the next one's β are before the bar if both are, that is
+    up to `sample_efficiency_common`. 0, too, for a time of which there are fewer than two.
+    """
+    reached = sample_efficiency_common(curve)
+    stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
+    until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
+    before = _correlation(stagnation[:until], betas[: reached.number])
+    after = _correlation(stagnation[max(0, until - 1) :], betas)
+    return before, 0.0 if reached.censored else after
+
+
+def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
+    """Of each entry but the last with the β after it; both end with the same episode."""
+    following = betas[len(betas) - len(stagnation) + 1 :]
+    if len(following) < 2 or np.ptp(stagnation[:-1]) == 0 or np.ptp(following) == 0:
         return 0.0
-    return float(scipy.stats.spearmanr(stagnation, following).statistic)
+    return float(scipy.stats.spearmanr(stagnation[:-1], following).statistic)
 
 
 def sample_efficiency(curve: LearningCurve) -> Attained:
@@ -192,9 +229,9 @@ def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
     first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learned.
     """
-    floor = int(PUBLIC_CODE_FLOOR * (len(curve.returns) - PUBLIC_CODE_WINDOW + 1))
-    flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[floor:]) < PUBLIC_CODE_SLOPE
-    return curve.first(flat, floor + 1)
+    first = _public_code_first(PUBLIC_CODE_WINDOW, len(curve.returns))
+    flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[first - 1 :]) < PUBLIC_CODE_SLOPE
+    return curve.first(flat, first)
 
 
 def sample_efficiency_common(curve: LearningCurve) -> Attained:
@@ -240,23 +277,33 @@ def solved(curve: LearningCurve) -> float:
     return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
 
 
-def _episodes(function: Callable[[LearningCurve], Attained], label: str, *needs: str) -> Metric:
-    return Metric(function.__name__, label, "episodes", function, *needs)
+def _public_code_first(window: int, episodes: int) -> int:
+    return int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1
+
+
+def _episodes(
+    function: Callable[[LearningCurve], Attained], label: str, windows: int, *needs: str
+) -> Metric:
+    name, earliest = function.__name__, lambda window, _: max(1, windows * window)
+    return Metric(name, label, "episodes", function, *needs, earliest=earliest)
 
 
 METRICS = (  # the area is under the learning curve, per episode
     Metric("final_return", "Final return", "return", lambda curve: curve.final),
-    _episodes(sample_efficiency, "Sample efficiency"),
-    _episodes(convergence_steps, "Convergence"),
+    _episodes(sample_efficiency, "Sample efficiency", 0),
+    _episodes(convergence_steps, "Convergence", 2),
     Metric("area_under_curve", "Mean return of training", "return", lambda c: c.returns.mean()),
     Metric("early_return", "Mean return of the beginning", "return", early_return),
     Metric("solved", "Solved at the end", "share", solved, "solved_return"),
-    _episodes(sample_efficiency_common, "Sample efficiency (common bar)", "reference_return"),
-    _episodes(sample_efficiency_range, "Sample efficiency (range)"),
-    _episodes(convergence_steps_range, "Convergence (range)"),
-    _episodes(convergence_steps_steepest, "Convergence (steepest)"),
-    _episodes(convergence_steps_flattest, "Convergence (flattest)"),
-    _episodes(convergence_steps_public_code, "Convergence (public code)"),
+    _episodes(sample_efficiency_common, "Sample efficiency (common bar)", 1, "reference_return"),
+    _episodes(sample_efficiency_range, "Sample efficiency (range)", 1),
+    _episodes(convergence_steps_range, "Convergence (range)", 1),
+    _episodes(convergence_steps_steepest, "Convergence (steepest)", 2),
+    _episodes(convergence_steps_flattest, "Convergence (flattest)", 2),
+    replace(
+        _episodes(convergence_steps_public_code, "Convergence (public code)", 0),
+        earliest=_public_code_first,
+    ),
 )
 
 

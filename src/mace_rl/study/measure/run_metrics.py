@@ -12,6 +12,8 @@ import pandas as pd
 from mace_rl.config.section import ConfigError
 from mace_rl.records import RecordError, RunKey, read_table
 from mace_rl.study.measure.metrics import (
+    CORRELATION,
+    CORRELATIONS,
     Attained,
     LearningCurve,
     Metric,
@@ -19,11 +21,16 @@ from mace_rl.study.measure.metrics import (
     final_return,
     metrics_columns,
     stagnation_correlation,
+    stagnation_correlations,
 )
 from mace_rl.study.metrics_config import MetricsConfig
 
-BETAS = {"env": str, "variant": str, "seed": int}  # the columns of betas.csv
-BETAS |= dict.fromkeys(("beta_end", "beta_lowest", "beta_highest", "stagnation_correlation"), float)
+
+def betas_columns(settings: MetricsConfig) -> dict[str, type]:
+    """The columns of betas.csv; without a common bar nothing is before or after it."""
+    measured = ["beta_end", "beta_lowest", "beta_highest"]
+    measured += CORRELATIONS if settings.reference_return else [CORRELATION]
+    return {"env": str, "variant": str, "seed": int} | dict.fromkeys(measured, float)
 
 
 def metrics_of_run(
@@ -31,13 +38,9 @@ def metrics_of_run(
 ) -> dict[str, str | int | float]:
     """The row of metrics.csv of one run, from its records (`read_episodes`)."""
     environment, variant, seed = run
-    returns = frame["extrinsic_return"].to_numpy()
-    final = final_return(returns, settings.final_fraction)
-    random = settings.random_return_in(environment)
-    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
-    curve = LearningCurve(returns, final, random, settings, *goals)
+    curve = _curve(frame, environment, settings)
     row: dict[str, str | int | float]
-    row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(returns)}
+    row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(curve.returns)}
     row["env_steps"] = int(frame["env_steps"].iloc[-1])
     metrics = all_metrics(settings)
     for metric in metrics:
@@ -50,6 +53,14 @@ def metrics_of_run(
             kind = "an Attained" if metric.unit == "episodes" else "a finite number"
             raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
     return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def _curve(frame: pd.DataFrame, environment: str, settings: MetricsConfig) -> LearningCurve:
+    returns = frame["extrinsic_return"].to_numpy()
+    final = final_return(returns, settings.final_fraction)
+    random = settings.random_return_in(environment)
+    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
+    return LearningCurve(returns, final, random, settings, *goals)
 
 
 def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
@@ -65,15 +76,17 @@ def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) 
 def betas_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
     """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation.
 
-    The end is that of `final_return`; the last column is what `stagnation_correlation` says.
+    The end is that of `final_return`; the last columns are what `stagnation_correlation` says and,
+    where there is a common bar, `stagnation_correlations`.
     """
     rows = []
     for run, frame in runs.items():
-        returns, beta = (frame[name].to_numpy() for name in ("extrinsic_return", "beta"))
+        beta, curve = frame["beta"].to_numpy(), _curve(frame, run[0], settings)
         end = final_return(beta, settings.final_fraction)
-        correlation = stagnation_correlation(returns, beta, settings.moving_average)
-        rows.append([*run, end, beta.min(), beta.max(), correlation])
-    return pd.DataFrame(rows, columns=list(BETAS))
+        found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
+        found += stagnation_correlations(curve, beta) if settings.reference_return else []
+        rows.append([*run, end, beta.min(), beta.max(), *found])
+    return pd.DataFrame(rows, columns=list(betas_columns(settings)))
 
 
 def read_metrics(

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.aggregate import SCORED
-from mace_rl.study.compare.ledger import Answer, Finding
+from mace_rl.study.compare.estimates import CONFIDENCE, WORTH_MENTIONING
+from mace_rl.study.compare.ledger import Answer, Finding, SizedFinding
 from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
-from mace_rl.study.compare.verdicts import CONFIDENCE, WORTH_MENTIONING
 from mace_rl.study.measure.metrics import metric_labels
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.curves import LEGEND_HEIGHT, PlotStyle, grid, legend, style
@@ -31,6 +31,7 @@ OUTCOMES = {
     "absent": ("#0173b2", "absent: no effect worth mentioning"),
     "reversed": ("#d55e00", "reversed"),
 }
+NO_ROOM = {"no_room": ("#cc78bc", "no room for an effect worth mentioning")}  # the second rule's
 INK = "#262626"  # as seaborn draws axes
 LINE = 0.75  # the height of a line of words, where a part has 1
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
@@ -169,7 +170,7 @@ def forest(source: Source) -> pd.DataFrame:
     Columns: measured (in which way), claim, statement, verdict and answer (of the claim, in its
     own words and in those of parts), part (what tells it from the claim's others), metric, seeds,
     difference, low, high, paper (the same in the paper's Table 1; NaN where that has none), outcome
-    (of the part). More is in the claim's favour.
+    (of the part), by the second rule its size. More is in the claim's favour.
     """
     rows = []
     for how in dict.fromkeys(how for answer in source.answers for how in answer.ways):
@@ -180,10 +181,11 @@ def forest(source: Source) -> pd.DataFrame:
                 values = part.difference, part.low, part.high, part.in_paper
                 scaled = [value / part.worth_mentioning for value in values]
                 measured = (_what(part, judged.parts, source), part.metric, part.seeds)
-                rows.append((*common, *measured, *scaled, part.outcome))
+                size = [part.size] if isinstance(part, SizedFinding) else []
+                rows.append((*common, *measured, *scaled, part.outcome, *size))
     columns = ["measured", "claim", "statement", "verdict", "answer", "part", "metric", "seeds"]
-    columns += ["difference", "low", "high", "paper", "outcome"]
-    return pd.DataFrame(rows, columns=columns)
+    columns += ["difference", "low", "high", "paper", "outcome", "size"]
+    return pd.DataFrame(rows, columns=columns[: len(rows[0])])
 
 
 def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
@@ -203,6 +205,8 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
     hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
+    by_size = "size" in table
+    outcomes, unit = (OUTCOMES | NO_ROOM, "the margin") if by_size else (OUTCOMES, UNIT)
     ends = table[["low", "high", "difference", "paper"]].abs()
     reach = max(1, np.nanmax(ends.to_numpy()))
     claims = table.groupby("claim", sort=False)[["claim", "statement"]].first()
@@ -215,7 +219,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
         figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
         for how, axes in zip(ways, panels, strict=True):
             own = table[table["measured"] == how]
-            for outcome, (colour, label) in OUTCOMES.items():
+            for outcome, (colour, label) in outcomes.items():
                 parts = own[own["outcome"] == outcome]
                 bars = parts["place"], parts["low"], parts["high"]
                 axes.hlines(*bars, color=colour, linewidth=1.2)
@@ -227,12 +231,12 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-1.1 * reach, 1.8 * reach), yticks=[])
-            axes.set_xlabel(f"Difference in favour of what is said\n(1: {UNIT})")
+            axes.set_xlabel(f"Difference in favour of what is said\n(1: {unit})")
             for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
                 name = claim["claim"].iloc[0]
                 top, end = blocks[name]
                 (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
-                colour, _ = OUTCOMES[answer]
+                colour, _ = outcomes[answer]
                 axes.text(1.8 * reach, top + 0.5, verdict, color=colour, ha="right", **small)
                 for panel in (names, axes):
                     panel.axhspan(top, end, color="0.9" if shade % 2 else "white", zorder=0)
@@ -244,7 +248,8 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
         for panel in (names, *panels):
             panel.set_ylim(count, 0)
         level = f"{100 * CONFIDENCE:g} % interval"
-        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: {UNIT}, the margin.")
+        dashed = unit if by_size else f"{unit}, the margin"
+        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: {dashed}.")
     return figure
 
 

@@ -21,9 +21,9 @@ from matplotlib.colors import to_hex
 from mace_rl.config.agent import PPOConfig
 from mace_rl.runs.progress import duration
 from mace_rl.study.claims_config import ClaimsConfig
+from mace_rl.study.compare.estimates import FEWEST_SEEDS
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.compare.verdicts import FEWEST_SEEDS
 from mace_rl.study.measure.metrics import metric_labels
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 from mace_rl.study.show import sections, tables
@@ -77,7 +77,7 @@ def page(
         families=sections.by_family(answers),
         counted=sections.counted,
         parts=lambda answer, how: tables.parts([answer], how, names).iloc[:, 1:],
-        parts_note=sections.PARTS,
+        parts_note=sections.PARTS_BY_RULE[claims.rule],
         fewest=FEWEST_SEEDS,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),
         runs=len(records),

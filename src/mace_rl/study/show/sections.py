@@ -12,10 +12,10 @@ import pandas as pd
 from mace_rl.records import read_table
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.comparisons import ALL
+from mace_rl.study.compare.estimates import POWER
 from mace_rl.study.compare.ledger import Answer, read_ledger
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.compare.verdicts import POWER
-from mace_rl.study.measure.run_metrics import BETAS, read_metrics
+from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
 
@@ -28,6 +28,11 @@ PARTS = (
     f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
     " correction."
 )
+PARTS_BY_RULE = {
+    1: PARTS,
+    2: f"{PARTS} *Room*: how much better than the second any run could be, or is. *One seed*: where"
+    " our difference would lie if the paper's, of one run each, differed from it by chance.",
+}
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
 
@@ -52,7 +57,7 @@ def read_data(
     if "metrics" in found:
         data["metrics"] = read_metrics(found["metrics"], runs, settings)
     if "betas" in found:
-        data["betas"] = read_table(found["betas"], BETAS)
+        data["betas"] = read_table(found["betas"], betas_columns(settings))
     return data, read_ledger(found["ledger"]) if "ledger" in found else []
 
 
@@ -65,7 +70,7 @@ def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
 def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
     """How many claims of one family have which verdict, in words."""
     counts = Counter(answer.ways[how].verdict for answer in answers)
-    words = claims.families[answers[0].family].words.model_dump().values()
+    words = claims.families[answers[0].family].words.model_dump(exclude_none=True).values()
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
 
 
@@ -73,11 +78,12 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
     """Family by family the verdicts, and then the parts in each way to measure them."""
     for title, own in by_family(answers).items():
         verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
-        note = f"Of {len(own)}, {verdicts}. The rule: docs/protocol.md."
+        page = "metrics" if claims.rule == 2 else "protocol"
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/{page}.md."
         yield Section(title.capitalize(), note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
-            yield Section(f"Part by part: {how}", PARTS, frame, level=3)
+            yield Section(f"Part by part: {how}", PARTS_BY_RULE[claims.rule], frame, level=3)
 
 
 def of_runs(

@@ -15,7 +15,7 @@ import pandas as pd
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.runs.progress import duration
 from mace_rl.study.claims_config import Table1Config, Table2Config
-from mace_rl.study.compare.ledger import Answer
+from mace_rl.study.compare.ledger import Answer, SizedFinding
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
@@ -256,11 +256,20 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
                 _estimate(vars(part), "probability", 2),
                 *(_number(part.in_paper, digits), _number(part.worth_mentioning, digits)),
                 _number(part.detectable, digits),
-                part.outcome,
+                *(_by_size(part, digits) if isinstance(part, SizedFinding) else [part.outcome]),
             ]
         )
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
-    return pd.DataFrame(rows, columns=[*heads, "margin", "detectable", ""])
+    heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
+    return pd.DataFrame(rows, columns=[*heads[: len(rows[0]) - 1], ""])
+
+
+def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
+    """What the second rule says of a part."""
+    ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
+    chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
+    outcome = part.outcome.replace("_", " ")
+    return [_number(part.room, digits), chance, part.replication, part.size, outcome]
 
 
 def costs(
