@@ -122,7 +122,7 @@ onstart:
 onsuccess:
     global LAST
     LAST += ("Elapsed time: ",)
-    for folder in {Path(episodes).parent for episodes in EPISODES}:
+    for folder in map(Path, MADE):
         # Not of an unfinished run, which was not asked for this time.
         if (folder / files.RECORD).exists():
             (folder / files.CHECKPOINT).unlink(missing_ok=True)

@@ -1,7 +1,6 @@
 """The report: what the template `report.html` shows, from a study's outputs.
 
-One file that needs nothing else: pictures and styles stand in it, there is no script, and its
-content security policy has the browser refuse whatever would be loaded.
+One file that needs nothing else: pictures and styles stand in it, and there is no script.
 """
 
 import html
@@ -68,9 +67,7 @@ def page(
     environment.filters |= {"three_digits": three_digits, "table": as_html, "note": _note}
     metrics, records = data["metrics"], provenance.records
 
-    def of(figure: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-        return data[f"figure{figure}"], data[f"figure{figure}_seeds"]
-
+    figures = {name: (data[f"figure{name}"], data[f"figure{name}_seeds"]) for name in FIGURES}
     names = dict(look.labels) | metric_labels(settings)
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
@@ -88,8 +85,8 @@ def page(
         labels=look.labels,
         colours={variant: style()(to_hex)(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
-        figures={name: panels(*of(name), quantity(name, settings), look) for name in FIGURES},
-        curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
+        figures={k: panels(*own, quantity(k, settings), look) for k, own in figures.items()},
+        curved={name: set(curves["variant"]) for name, (curves, _) in figures.items()},
         shown=animations[0],
         missing=animations[1],
         pictures=_pictures(Source(data, answers, settings, claims), look),
@@ -166,19 +163,15 @@ def _sections(
     costs = tables.costs(provenance.records, data["metrics"], names)
     interruptions = sum(len(record["interruptions"]) for record in provenance.records)
     machine = "As each run's run.json has it; one core a run, no GPU."
-    others = {
-        "Variants against each other, on every metric": (
-            note,
-            tables.comparisons(compared, means, settings),
-        ),
-        "Costs": (f"{machine} Interruptions: {interruptions}.", costs),
-        "PPO's settings, as resolved": (
-            "Table 2; for LaTeX table2.tex.",
-            tables.table2(provenance.ppo, claims.table2),
-        ),
-    }
-    found = {section.title: section for section in sections.of_runs(data, claims, settings, names)}
-    return found | {title: Section(title, *own) for title, own in others.items()}
+    compared = tables.comparisons(compared, means, settings)
+    ppo = tables.table2(provenance.ppo, claims.table2)
+    others = [
+        Section("Variants against each other, on every metric", note, compared),
+        Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
+        Section("PPO's settings, as resolved", "Table 2; for LaTeX table2.tex.", ppo),
+    ]
+    found = sections.of_runs(data, claims, settings, names)
+    return {section.title: section for section in [*found, *others]}
 
 
 def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, int]]]:
