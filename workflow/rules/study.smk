@@ -134,12 +134,11 @@ def queue_entry(wildcards):
 
 
 def code(script, settings=None):
-    """Digest of a script and of the code of mace_rl that it can use, for the `params:` of its rule.
+    """Digest of a script, of mace_rl and of the user's code in `settings`, for a rule's `params:`.
 
-    With `settings` that name code of the user's own (`references()`), of that too. A change of code,
-    by content, is thus a reason to run the job again. As an input it would not be: Snakemake goes by
-    an input's time stamp first, and records what it contained when the job ended, so code that was
-    edited meanwhile would pass for the code that ran.
+    A change of code is thus a reason to run the job again. As an input it would not be: Snakemake
+    goes by an input's time stamp first, and records what it contained when the job ended, so code
+    that was edited meanwhile would pass for the code that ran.
     """
     part = "training" if script == "train.py" else "everything"
     scripts = [Path(workflow.basedir, "workflow", "scripts", name) for name in (script, "job.py")]

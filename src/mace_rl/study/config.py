@@ -152,9 +152,8 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
     try:
         for variant in study.variants:
             check_known(variant, study.variant_settings, "variants", "variant_settings")
-        for variant in study.variant_settings:
-            _check_name(variant, "variant_settings")
         for variant, shown in study.variant_settings.items():
+            _check_name(variant, "variant_settings")
             if shown.colour is not None and not is_color_like(shown.colour):
                 raise ConfigError(
                     f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"

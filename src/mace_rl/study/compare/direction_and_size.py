@@ -1,7 +1,4 @@
-"""The second rule of verdicts: direction and size apart (docs/metrics.md, "The second rule").
-
-Is there a difference, is it worth mentioning, does the paper's agree, and was there room for one?
-"""
+"""The second rule of verdicts: direction and size apart (docs/metrics.md, "The second rule")."""
 
 from dataclasses import asdict, replace
 

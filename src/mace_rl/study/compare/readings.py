@@ -1,7 +1,6 @@
 """What decides the ranking: Table 1 under every reading of its two metrics (docs/metrics.md).
 
-Beside the runs as they are stand the same runs with their returns in random order. Whoever is first
-there is first by chance and by how returns are distributed, since nothing is learned in that order.
+Beside the runs stand the same runs with their returns in random order, in which nothing is learned.
 """
 
 import itertools
@@ -26,10 +25,7 @@ LEVEL = 0.05  # of the log-rank test that the first is really ahead
 
 
 def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metric]]:
-    """Every reading with the one of the paper's metrics that it reads, in the order of tables.
-
-    Only what counts episodes can be read in several ways.
-    """
+    """Every reading, in episodes, with the one of the paper's metrics that it reads."""
     both = itertools.product(table1.metrics, all_metrics(settings))
     return [
         (kind, one) for kind, one in both if one.unit == "episodes" and one.name.startswith(kind)

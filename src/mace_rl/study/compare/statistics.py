@@ -1,8 +1,6 @@
-"""Statistics over seeds: estimates, intervals and comparisons.
+"""Statistics over seeds, of float64 arrays [seeds], after Agarwal et al. 2021 (docs/metrics.md).
 
-Pure functions of float64 arrays of shape [seeds]; whatever draws random numbers takes the generator
-that it draws them from. An interval is a pair (low, high), both NaN where one seed allows none.
-After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
+An interval is a pair (low, high), both NaN where one seed allows none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -125,9 +123,8 @@ def stratified_comparison(
 ) -> PairedComparison:
     """The mean over strata (environments) of the mean paired difference, [seeds] in each.
 
-    The bootstrap resamples, and the sign-flip test flips, within the strata. With fewer than 10
-    seeds in one of them the interval is Student's t with the degrees of freedom of the smallest.
-    With one stratum: `paired_comparison`.
+    The bootstrap resamples within the strata. With fewer than 10 seeds in one of them the interval
+    is Student's t with the degrees of freedom of the smallest.
     """
     if len(differences) == 1:
         return paired_comparison(differences[0], confidence, repetitions, generator)

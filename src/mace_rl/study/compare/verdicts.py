@@ -1,8 +1,4 @@
-"""Do claims hold? The first rule is in docs/protocol.md, the claims are in a file: `claims_config`.
-
-A part of a claim, a comparison of two variants, is shown, reversed, absent or open; of these comes
-the verdict on the claim. A file may ask for the second rule instead: `direction_and_size`.
-"""
+"""Do claims hold? By the first rule (docs/protocol.md) or the second (`direction_and_size`)."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -25,7 +21,7 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -
     """An answer to each claim that the runs in `table` can answer.
 
     table: the frame of metrics.csv with the `CORRELATIONS` asked for; seeds may differ between
-    environments, not between variants. Of one seed there are no intervals and no tests: NaN.
+    environments, not between variants.
     """
     lacking = claims.lacking(table["env"], table["variant"], settings)
     asked = [title for title in claims.families if not lacking[title]]

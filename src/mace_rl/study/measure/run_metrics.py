@@ -53,20 +53,14 @@ def _curve(frame: pd.DataFrame, environment: str, settings: MetricsConfig) -> Le
 
 
 def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """One row of `metrics_columns` per run, in the order of `runs`.
-
-    Raises `ConfigError` and `RecordError` for metrics that cannot be.
-    """
+    """One row of `metrics_columns` per run, in the order of `runs`."""
     table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
     _check_attained("the table of metrics", table, all_metrics(settings))
     return table
 
 
 def betas_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation.
-
-    The end is that of `final_return`.
-    """
+    """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation."""
     rows = []
     for run, frame in runs.items():
         beta, curve = frame["beta"].to_numpy(), _curve(frame, run[0], settings)

@@ -43,10 +43,9 @@ def animations(
 ) -> tuple[dict[str, list[Animation]], list[str]]:
     """Films of one run of each environment and variant, and sentences on what there is not.
 
-    `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
+    `runs` are folders, which the sentences name as seen from `origin`. Variants whose untrained
     agents do the same share that film. Runs may name code from outside this package if their
-    configuration is among the reader's `own`. An agent that is not there and an environment that
-    cannot be drawn are said; an agent that is not the one of its `run.json` is an error.
+    configuration is among the reader's `own`.
     """
     missing = []
     without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]

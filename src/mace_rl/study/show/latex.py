@@ -34,9 +34,8 @@ def table1_latex(
     what = r". The best mean is \textbf{bold}. "
     if tables.counts_episodes(settings, paper):
         both = " for both" if len(paper.metrics) == 2 else ""
-        what = (
-            rf", in training episodes. Lower is better{both}; the lowest mean is \textbf{{bold}}. "
-        )
+        best = r"the lowest mean is \textbf{bold}. "
+        what = f", in training episodes. Lower is better{both}; {best}"
     caption = escaped(paper.caption) + what + _how(table, settings.confidence)
     frame = tables.table1(tables.named(table, labels), settings, paper)
     return latex_float(caption, "tab:table1", frame)

@@ -72,10 +72,7 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 def constants(source: Source) -> pd.DataFrame:
-    """The mean return of training of every variant, from the frame of metrics.csv.
-
-    Columns: env, variant, role (`FIXED_BETA`, `LEARNED` or `OTHER`), mean, low, high, seeds.
-    """
+    """The mean return of training of every variant, each with its role, from metrics.csv's frame."""
     runs, settings = source.data["metrics"], source.settings
     assert settings.constants is not None  # or nobody asks
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
@@ -121,10 +118,7 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 def solved(source: Source) -> pd.DataFrame:
-    """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame.
-
-    Columns: env, variant, solved, seeds.
-    """
+    """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame."""
     runs = source.data["metrics"]
     counted = runs.assign(solved=runs["solved"] >= SOLVED).groupby(["env", "variant"], sort=False)
     return counted["solved"].agg(solved="sum", seeds="size").reset_index()

@@ -29,9 +29,7 @@ from mace_rl.study.show import sections, tables
 from mace_rl.study.show.animations import Animation
 from mace_rl.study.show.curves import PlotStyle, quantity, style
 from mace_rl.study.show.pictures import PICTURES, Source
-from mace_rl.study.show.sections import Data, Section
 from mace_rl.study.show.svg import PAGE_COLOURS, panels, svg
-from mace_rl.study.show.tables import Cell, number
 
 TEMPLATE = Path(__file__).with_name("report.html")
 FIGURES = ("1", "2")
@@ -48,7 +46,7 @@ class Provenance:
 
 
 def page(
-    data: Data,
+    data: sections.Data,
     answers: Sequence[Answer],
     claims: ClaimsConfig,
     provenance: Provenance,
@@ -99,7 +97,7 @@ def page(
 def three_digits(value: float) -> str:
     """A return with three significant digits, or all that stand before the point."""
     digits = 2 - math.floor(math.log10(abs(value))) if value else 0
-    return number(value, max(digits, 0))
+    return tables.number(value, max(digits, 0))
 
 
 def as_html(frame: pd.DataFrame) -> Markup:
@@ -118,7 +116,7 @@ def as_html(frame: pd.DataFrame) -> Markup:
     return Markup('<div class="scroll"><table class="data">' + "\n".join(lines) + "</table></div>")
 
 
-def _html(cell: str | Cell) -> str:
+def _html(cell: str | tables.Cell) -> str:
     if isinstance(cell, str):
         return html.escape(cell)
     texts = [
@@ -147,13 +145,13 @@ def _pictures(source: Source, look: PlotStyle) -> dict[str, str]:
 
 
 def _sections(
-    data: Data,
+    data: sections.Data,
     claims: ClaimsConfig,
     provenance: Provenance,
     settings: MetricsConfig,
     names: Mapping[str, str],
-) -> dict[str, Section]:
-    """Every table but the ledger's, by its title, and three that the pages of Markdown have not."""
+) -> dict[str, sections.Section]:
+    """Every table but the ledger's, by its title, and three that the pages of Markdown lack."""
     compared = tables.named(data["comparisons"], names)
     means = pd.concat([data["table1"], data["supplement"]])
     note = (
@@ -165,13 +163,13 @@ def _sections(
     machine = "As each run's run.json has it; one core a run, no GPU."
     compared = tables.comparisons(compared, means, settings)
     ppo = tables.table2(provenance.ppo, claims.table2)
-    others = [
-        Section("Variants against each other, on every metric", note, compared),
-        Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
-        Section("PPO's settings, as resolved", "Table 2; for LaTeX table2.tex.", ppo),
-    ]
     found = sections.of_runs(data, claims, settings, names)
-    return {section.title: section for section in [*found, *others]}
+    found += [
+        sections.Section("Variants against each other, on every metric", note, compared),
+        sections.Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
+        sections.Section("PPO's settings, as resolved", "Table 2; for LaTeX table2.tex.", ppo),
+    ]
+    return {section.title: section for section in found}
 
 
 def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, int]]]:

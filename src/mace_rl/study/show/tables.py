@@ -1,7 +1,4 @@
-"""Every table of a study, as a frame of words (`str`) and `Cell`s of numbers with intervals.
-
-`markdown`, `report` and `latex` print it.
-"""
+"""Every table of a study, as a frame of words (`str`) and `Cell`s of numbers with intervals."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -253,11 +250,7 @@ def costs(
 
 
 def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
-    """The PPO hyperparameters, from the resolved settings of each environment.
-
-    The rows of the paper and Adam; then this project's further settings, those without a label
-    named after their key.
-    """
+    """The PPO hyperparameters: the paper's rows and Adam, then this project's further settings."""
     own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
     rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
     rows += [["Optimizer", "Adam"]]
