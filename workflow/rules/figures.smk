@@ -49,7 +49,6 @@ rule picture:
         "../scripts/picture.py"
 
 
-# Seconds of work that only Table 1 is worth.
 rule readings:
     input:
         records=RECORDS,

@@ -94,8 +94,9 @@ def _compare(
     for place, (metric, *found) in enumerate(zip(metrics, *compared, strict=True)):
         test = "sign-flip"
         if metric.unit == "episodes":
-            test, both = "log-rank", [values[:, place] for values in events]
-            found[-1] = statistics.logrank(*both, how[1], np.random.default_rng(seed))
+            mine, theirs = (values[:, place] for values in events)
+            test, seeded = "log-rank", np.random.default_rng(seed)
+            found[-1] = statistics.logrank(mine, theirs, how[1], seeded)
         difference, low, high, p_value = found
         rows[place] = rows[place]._replace(
             env=environment, difference=difference, low=low, high=high, test=test, p_value=p_value

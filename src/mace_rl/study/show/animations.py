@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,16 +23,6 @@ class Animation:
     still: str  # the last picture, for who prefers no motion
     variants: tuple[str, ...]
     trained: bool
-
-
-def first_seeds(
-    runs: Iterable[tuple[str, str, int, int]], records: Iterable[str]
-) -> dict[tuple[str, str], Path]:
-    """The folder of the first seed of each environment and variant; `records`: its `run.json`."""
-    folders: dict[tuple[str, str], Path] = {}
-    for (environment, variant, *_), record in zip(runs, records, strict=True):
-        folders.setdefault((environment, variant), Path(record).parent)
-    return folders
 
 
 def animations(

@@ -72,7 +72,7 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 def constants(source: Source) -> pd.DataFrame:
-    """The mean return of training of every variant, each with its role, from metrics.csv's frame."""
+    """The mean return of training of every variant, with its role, from metrics.csv's frame."""
     runs, settings = source.data["metrics"], source.settings
     assert settings.constants is not None  # or nobody asks
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
@@ -244,10 +244,7 @@ def _wrapped(words: str, width: int) -> str:
 def _placed(
     table: pd.DataFrame, lines: Mapping[str, int]
 ) -> tuple[pd.DataFrame, dict[str, tuple[float, float]]]:
-    """The parts with their `place` from the top, and from where to where each claim reaches.
-
-    lines: of text that stand beside a claim, and may need more room than its parts.
-    """
+    """The parts with their `place` from the top, and each claim's ends; lines: of its text."""
     end, blocks, placed = 0.0, {}, []
     for name, claim in table.groupby("claim", sort=False):
         order = claim.groupby("measured").cumcount()
