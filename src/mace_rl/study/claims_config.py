@@ -65,9 +65,9 @@ class Table1Config(Section):
 
 
 class Table2Config(Section):
-    """The paper's Table 2; both by the settings of `ppo`."""
+    """The paper's Table 2: labels by the setting of `ppo`."""
 
-    rows: dict[str, str] = Field(default={})  # what they are called there
+    rows: dict[str, str] = Field(default={})  # what the paper has
     others: dict[str, str] = Field(default={})  # what the paper leaves open
 
 
@@ -107,7 +107,7 @@ class ClaimConfig(Section):
 
 
 class WordsConfig(Section):
-    """What each kind of answer is called."""
+    """A family's word for each verdict."""
 
     shown: str
     reversed: str
@@ -142,7 +142,7 @@ class ClaimsConfig(Section):
     def lacking(
         self, environments: Iterable[str], variants: Iterable[str], settings: MetricsConfig
     ) -> dict[str, list[str]]:
-        """By family, what a study of these lacks for the family's parts: nothing, if it is asked.
+        """By family, what its parts need and a study of these lacks: if nothing, it is judged.
 
         Parts of returns have their margin by `metrics.reference_return` of their environments.
         """

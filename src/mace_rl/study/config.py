@@ -60,7 +60,7 @@ def _once(values: list[Any]) -> list[Any]:
 
 
 class Variant(Section):
-    """One variant: how it is shown, and settings over `training` and the environment's."""
+    """One variant: how it is shown; its settings go over `training` and the environment's."""
 
     model_config = Section.model_config | {"extra": "allow"}
 

@@ -73,7 +73,7 @@ class MetricsConfig(Section):
         return lines
 
     def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
-        """These settings without what `incomplete` names, for a study of these.
+        """These settings for a study of these; what `incomplete` names is left out.
 
         Raises `ConfigError` for a goal that random actions attain.
         """

@@ -165,7 +165,7 @@ def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
 def sample_efficiency(curve: LearningCurve) -> Attained:
     """The first episode with a return ≥ threshold · final (paper, literally).
 
-    Where returns are negative the bar is above the final return. Censored: none, or not `learned`.
+    Negative returns: the bar is above the final return. Censored: never reached, or not `learned`.
     """
     reached = curve.returns >= curve.settings.threshold * curve.final
     return curve.first(reached & curve.learned)
@@ -175,8 +175,8 @@ def convergence_steps(curve: LearningCurve) -> Attained:
     """The point where the slope of the moving average becomes minimal (paper).
 
     Our reading: the first episode, once the average has come threshold of the way from random to
-    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored: none,
-    or not `learned`.
+    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored:
+    never, or not `learned`.
     """
     settings, window = curve.settings, curve.settings.moving_average
     high = curve.average >= curve.bar(curve.final)
@@ -189,7 +189,7 @@ def convergence_steps(curve: LearningCurve) -> Attained:
 def convergence_steps_steepest(curve: LearningCurve) -> Attained:
     """The first episode after the steepest rise at which the slope is no longer positive.
 
-    The steepest rise can be the recovery from a late collapse. Censored: none, or not `learned`.
+    The steepest rise can be the recovery from a late collapse. Censored: never, or not `learned`.
     """
     window, slopes = curve.settings.moving_average, curve.slopes
     if not (slopes > 0).any():
@@ -202,7 +202,7 @@ def convergence_steps_flattest(curve: LearningCurve) -> Attained:
     """The first episode at which the absolute slope is smallest in all of training.
 
     The most literal reading: it finds the flat start of a run that has yet to learn, or chance on
-    the final plateau. Censored: none, or not `learned`.
+    the final plateau. Censored: E < 2 windows, or not `learned`.
     """
     magnitude = np.abs(curve.slopes)
     flattest = magnitude == magnitude.min(initial=np.inf)

@@ -60,7 +60,7 @@ def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) 
 
 
 def betas_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """The data of betas.csv: of each run β at its end, its range, its rank correlation."""
+    """The data of betas.csv: of each run β at its end, its range, its stagnation correlations."""
     rows = []
     for run, frame in runs.items():
         beta, curve = frame["beta"].to_numpy(), _curve(frame, run[0], settings)

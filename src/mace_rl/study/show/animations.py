@@ -20,7 +20,7 @@ class Animation:
     title: str
     extrinsic_return: float  # of the whole episode
     moving: str
-    still: str  # the last picture, for who prefers no motion
+    still: str  # the last picture, for readers who prefer no motion
     variants: tuple[str, ...]
     trained: bool
 

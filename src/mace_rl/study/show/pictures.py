@@ -74,7 +74,7 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
 def constants(source: Source) -> pd.DataFrame:
     """The mean return of training of every variant, with its role, from metrics.csv's frame."""
     runs, settings = source.data["metrics"], source.settings
-    assert settings.constants is not None  # or nobody asks
+    assert settings.constants is not None  # `fits` has asked
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
     roles[settings.constants.learned] = LEARNED

@@ -37,7 +37,7 @@ FIGURES = ("1", "2")
 
 @dataclass(frozen=True)
 class Provenance:
-    """How it was made."""
+    """How the study's results were made."""
 
     command: str
     configuration: Mapping[str, str]  # text by file, in the order in which they are read

@@ -35,7 +35,7 @@ class Value(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Several values in one cell, and what is to be said beside them. (One word is a `str`.)"""
+    """Several values in one cell, and a note beside them. (Words alone are a `str`.)"""
 
     values: Sequence[Value]
     joint: str = " / "
