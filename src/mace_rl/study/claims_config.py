@@ -91,9 +91,10 @@ class PartsConfig(Section):
         parts = []
         for group in [self.environments] if self.together else [[env] for env in self.environments]:
             paper = table1.values_of(group, self.metric)
-            for other in self.over or [None]:
-                in_paper = paper.get(self.variant, math.nan) - paper.get(other or "", math.nan)
-                parts.append(Part(tuple(group), self.metric, self.variant, other, float(in_paper)))
+            for other in self.over or [""]:
+                in_paper = float(paper.get(self.variant, math.nan) - paper.get(other, math.nan))
+                own = self.metric, self.variant, other or None
+                parts.append(Part(tuple(group), *own, in_paper))
         return parts
 
 

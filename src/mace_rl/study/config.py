@@ -161,7 +161,7 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
                 )
         [(label, count)] = Counter(study.labels.values()).most_common(1)
         if count > 1:
-            raise ConfigError(f"{count} variants share the label {label!r}; each should have one")
+            raise ConfigError(f"{count} variants have the label {label!r}; each needs its own")
         for variant in itertools.chain.from_iterable(study.metrics.comparisons):
             check_known(variant, study.variant_settings, "metrics.comparisons", "variant_settings")
         known = dict.fromkeys([*study.environments, *study.environment_settings])

@@ -59,13 +59,15 @@ def find(part: Part, pairs: Sequence[Pair], margin: float, settings: MetricsConf
     seed = settings.bootstrap_seed
     columns = [(pair.variant[:, None], pair.baseline[:, None]) for pair in pairs]
     compared = stratified_comparison(differences, *how, np.random.default_rng(seed))
+    difference, low, high, p_value = map(float, compared)
     improved = probability_of_improvement(columns, *how, np.random.default_rng(seed))
+    chance, lowest, highest = (bound.item() for bound in improved)
     return Finding(
         *part[:4],
         unit,
         min(map(len, differences)),
-        *map(float, compared),
-        *(bound.item() for bound in improved),
+        *(difference, low, high, p_value),
+        *(chance, lowest, highest),
         _detectable(differences),
         margin,
         -part.in_paper if unit == "episodes" else part.in_paper,

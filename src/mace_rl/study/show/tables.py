@@ -70,9 +70,9 @@ def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) ->
     digits, units = digits_by_metric(table, settings), metric_units(settings)
     best: dict[Any, str] = {}
     attained = table[table["censored"] < table["seeds"]]
-    for key, means in attained.groupby(["env", "metric"])["mean"]:
-        first = means.min() if units[key[1]] == "episodes" else means.max()
-        best[key] = number(first, digits[key])
+    for (env, metric), means in attained.groupby(["env", "metric"])["mean"]:
+        first = means.min() if units[str(metric)] == "episodes" else means.max()
+        best[env, metric] = number(first, digits[str(env), str(metric)])
 
     def cell(runs: pd.DataFrame) -> Cell:
         values, published = [], []
