@@ -145,7 +145,8 @@ def tanh_layers(parameters: Iterable[tuple[np.ndarray, np.ndarray]]) -> torch.nn
     layers: list[torch.nn.Module] = []
     for weights, biases in parameters:
         generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-        layer = torch.nn.Linear(*weights.shape, device="cpu", dtype=torch.float32)
+        inputs, outputs = weights.shape
+        layer = torch.nn.Linear(inputs, outputs, device="cpu", dtype=torch.float32)
         torch.set_rng_state(generator)
         with torch.no_grad():
             layer.weight.copy_(torch.from_numpy(weights.T))
