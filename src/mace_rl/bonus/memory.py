@@ -44,22 +44,14 @@ class EpisodicMemory(Stateful):
         """
         self.usage[self.read], self.read[:] = self.time + 1, False
         self.time += 2
-        kept = min(len(keys), self.config.capacity)
-        # Of equally used ones the first written goes: a long episode reads nearly every entry.
-        age = self.usage * 2**32 + self.number
-        oldest = np.argpartition(age, kept - 1)[:kept]
-        oldest = oldest[np.argsort(age[oldest])]
-        self.keys[oldest] = keys[-kept:]
-        self.values[oldest] = np.column_stack([next_states, rewards, returns])[-kept:]
-        self.usage[oldest] = self.time
-        self.number[oldest] = self.written + np.arange(1, kept + 1)
-        self.written += kept
-        self.stored = min(self.stored + kept, self.config.capacity)
-        stays = np.full(self.config.capacity, True)
-        stays[oldest] = False
-        before = self.newest_first
-        self.newest_first = np.concatenate([oldest[::-1], before[stays[before]]])
-        self.neighbours = None
+        new = least_recently_used(self.usage, self.number, min(len(keys), len(self.keys)))
+        values = np.column_stack([next_states, rewards, returns])
+        self.keys[new], self.values[new] = keys[-len(new) :], values[-len(new) :]
+        self.usage[new], self.number[new] = self.time, self.written + np.arange(1, len(new) + 1)
+        before = self.newest_first[self.number[self.newest_first] <= self.written]
+        self.newest_first = np.concatenate([new[::-1], before])
+        self.written += len(new)
+        self.stored, self.neighbours = len(self.newest_first), None
 
     def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
         """From now on distances are Euclidean between (x - mean) / std; both are [key]."""
@@ -67,27 +59,19 @@ class EpisodicMemory(Stateful):
         newest = np.take(self.keys, self.newest_first, axis=0)
         self.neighbours = Neighbours(newest, mean, std)
 
-    def search(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The k nearest entries to each state, float32 [N, key]; marks them as read.
+    def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Kernel-weighted mean of the k nearest entries' returns, and similarity of the nearest.
 
-        Returns squared distances, float32 [N, k] ascending, divided by the number of dimensions,
-        and the entries, int64 [N, k]. Raises `LookupError` if nothing is stored or indexed.
+        states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5), with d²
+        per dimension. Returns float32 [N] each; similarity, in (0, 1], is the kernel at the nearest
+        key over that at 0. Entries are marked as read; `LookupError` if none is stored or indexed.
         """
         if not self.neighbours:
             raise LookupError("the episodic memory is empty, or not indexed since it was written")
         count = min(self.config.neighbours, len(self.neighbours))
-        squared_distances, places = self.neighbours.nearest(states, count)
-        entries = self.newest_first[places]
-        self.read[entries] = True
-        return squared_distances / np.float32(states.shape[1]), entries
-
-    def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Kernel-weighted mean of the k nearest entries' returns, and similarity of the nearest.
-
-        states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5). Returns
-        float32 [N] each; similarity, in (0, 1], is the kernel at the nearest key over that at 0.
-        """
-        return recollect(*self.search(states), self.values[:, -1], self.config.kernel_bandwidth)
+        found = self.neighbours.nearest(states, count)
+        entries = self.newest_first, self.values, self.read
+        return recollect(*found, *entries, states.shape[1], self.config.kernel_bandwidth)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `Stateful` says; `build_index` before the next look-up."""
@@ -97,17 +81,33 @@ class EpisodicMemory(Stateful):
 
 
 @kernel
-def recollect(
-    squared_distances: np.ndarray, indices: np.ndarray, returns: np.ndarray, bandwidth: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """`EpisodicMemory.recall` from what `search` returns, and all entries' returns, float32 [M]."""
+def least_recently_used(usage, number, count):
+    """`count` entries in order, int64; of the many that are equally used, the first written."""
+    oldest, ages, found = np.empty(count, np.int64), np.empty(count, np.int64), 0  # ascending
+    for entry in range(len(usage)):
+        age = usage[entry] * 2**32 + number[entry]
+        if found == count and age > ages[-1]:
+            continue
+        place, found = min(found, count - 1), min(found + 1, count)
+        while place > 0 and ages[place - 1] > age:
+            oldest[place], ages[place] = oldest[place - 1], ages[place - 1]
+            place -= 1
+        oldest[place], ages[place] = entry, age
+    return oldest
+
+
+@kernel
+def recollect(squared_distances, places, newest_first, values, read, size, bandwidth):
+    """`EpisodicMemory.recall` from what `Neighbours.nearest` found; marks entries in `read`."""
     recalled, similarity = np.empty((2, len(squared_distances)), np.float32)
     for n in range(len(squared_distances)):
         total = weighted = 0.0
         for i in range(squared_distances.shape[1]):
-            weight = 1 / (squared_distances[n, i] + bandwidth)
+            entry = newest_first[places[n, i]]
+            read[entry] = True
+            weight = 1 / (squared_distances[n, i] / np.float32(size) + bandwidth)
             total += weight
-            weighted += weight * returns[indices[n, i]]
+            weighted += weight * values[entry, -1]
         recalled[n] = weighted / total
-        similarity[n] = bandwidth / (squared_distances[n, 0] + bandwidth)
+        similarity[n] = bandwidth / (squared_distances[n, 0] / np.float32(size) + bandwidth)
     return recalled, similarity

@@ -60,7 +60,7 @@ class LastEpisodes:
     def begin(self, environment: Environment) -> None:
         """Before an episode."""
         block = self.blocks[-1]
-        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+        if len(block) >= EPISODES or sum(one["actions"].size(0) for one in block) >= STEPS:
             self.blocks = [block, []]
         self.start = state_of(environment, of_process=not self.blocks[-1])
 
