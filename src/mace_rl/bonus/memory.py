@@ -81,7 +81,7 @@ class EpisodicMemory(Stateful):
 
 
 @kernel
-def least_recently_used(usage, number, count):
+def least_recently_used(usage: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
     """`count` entries in order, int64; of the many that are equally used, the first written."""
     oldest, ages, found = np.empty(count, np.int64), np.empty(count, np.int64), 0  # ascending
     for entry in range(len(usage)):
