@@ -158,7 +158,7 @@ def test_betas_are_of_runs_in_which_beta_changes() -> None:
     low, high = scipy.stats.t.interval(0.95, 2, 0.375, 0.125 / 3**0.5)
     assert list(row[:2]) == ["A-v0", "mace_full"]
     assert list(row[3:5]) == ["0.12, 0.50, 0.90", "0.10, 0.20, 0.25"]
-    assert row[5].values == [estimate(0.375, low, high, 3)]
+    assert row[5].values == [estimate((0.375, low, high), 3)]
 
 
 def test_table_2_has_the_papers_rows_then_ours() -> None:

@@ -1,12 +1,14 @@
 """The rollout of an update: episodes with their bonus, advantages and returns."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.environments.rollout import Episode
+from mace_rl.numerics.arrays import mean, variance
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,18 @@ class Experience:
     def intrinsic_share(self) -> np.ndarray:
         """β A_I."""
         return self.beta * self.intrinsic_part
+
+    def with_normalised_returns(self) -> "Experience":
+        """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
+        old = {k: getattr(self, f"{k}_returns") for k in ("extrinsic", "intrinsic")}
+        returns = old["extrinsic"] + self.beta * old["intrinsic"]
+        unit = math.sqrt(variance(returns) * len(returns) / max(len(returns) - 1, 1)) + 1e-7
+        new = {f"{k}_returns": (part - mean(part)) / unit for k, part in old.items()}
+        new |= {
+            f"{k}_advantages": getattr(self, f"{k}_advantages") + new[f"{k}_returns"] - part
+            for k, part in old.items()
+        }
+        return replace(self, **new)
 
 
 def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:

@@ -80,7 +80,9 @@ def intrinsic_reward(
 def environment(config: AgentConfig, streams: Streams) -> Environment:
     """The environment that the agent acts in."""
     limits = config.max_episode_steps, config.environment_arguments
-    return Environment(config.environment, streams.sequence("environment"), *limits)
+    made = Environment(config.environment, streams.sequence("environment"), *limits)
+    made.clips_actions = config.ppo.clip_actions
+    return made
 
 
 def actor_critic(

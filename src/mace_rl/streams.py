@@ -8,7 +8,8 @@ import numpy as np
 # A stream's place here is its key, so new streams go at the end.
 STREAMS = (
     *("environment", "actions", "minibatches", "actor", "extrinsic_critic", "intrinsic_critic"),
-    *("density", "density_batches", "meta", "novelty", "beta", "bonus"),  # meta: not drawn from
+    # "density" and what follows it: of the bonus and β; "meta" and "dropout" in `published` alone.
+    *("density", "density_batches", "meta", "novelty", "beta", "bonus", "dropout"),
 )
 
 

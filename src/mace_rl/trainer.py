@@ -41,14 +41,17 @@ class Trainer:
         self.config = config
         streams = Streams(config.seed)
         self.environment = environment(config, streams)
-        self.controller = beta_controller(config, self.environment, streams)
-        self.curiosity = intrinsic_reward(config, self.environment, streams)
-        self.ppo = ppo(config, self.environment, self.curiosity is not None, streams)
-        self.play = rollout_for(self.environment, self.ppo.acting_policy())
+        self._make_parts(streams)
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
         self.last_episodes = resuming.LastEpisodes()
+
+    def _make_parts(self, streams: Streams) -> None:
+        self.controller = beta_controller(self.config, self.environment, streams)
+        self.curiosity = intrinsic_reward(self.config, self.environment, streams)
+        self.ppo = ppo(self.config, self.environment, self.curiosity is not None, streams)
+        self.play = rollout_for(self.environment, self.ppo.acting_policy())
 
     def run(self) -> Iterator[list[EpisodeRecord]]:
         """Train to the last episode; yields the records of each round after its update.
@@ -90,7 +93,9 @@ class Trainer:
             self.last_episodes.begin(self.environment)
             episode = self.play(self.environment, policy, noise)
             self.last_episodes.end(episode)
-            rollout.append(self.appraise(episode))
+            item = self.appraise(episode)
+            own_units = self.config.ppo.normalise_returns
+            rollout.append(item.with_normalised_returns() if own_units else item)
             collected += len(episode)
         return rollout
 
@@ -123,18 +128,7 @@ class Trainer:
             paid = paid_returns(episode.rewards, self.config.ppo.discount)
             self.curiosity.remember(episode, paid)
             self.controller.next_episode(episode, reward)
-        before = self.records[-1].env_steps if self.records else 0
-        self.records.append(
-            EpisodeRecord(
-                episode=len(self.records) + 1,
-                env_steps=before + len(episode),
-                length=len(episode),
-                extrinsic_return=total(episode.rewards),
-                intrinsic_return=rounded(total(reward)),
-                beta=rounded(beta),
-                terminated=int(episode.terminated),
-            )
-        )
+        self._record(episode, reward, beta)
         return Experience(
             episode=episode,
             observations=observations,
@@ -146,6 +140,20 @@ class Trainer:
             intrinsic_returns=intrinsic_returns,
             extrinsic_scale=self.ppo.advantage_scale("extrinsic"),
             intrinsic_scale=intrinsic_scale,
+        )
+
+    def _record(self, episode: Episode, bonus: np.ndarray, beta: float) -> None:
+        before = self.records[-1].env_steps if self.records else 0
+        self.records.append(
+            EpisodeRecord(
+                episode=len(self.records) + 1,
+                env_steps=before + len(episode),
+                length=len(episode),
+                extrinsic_return=total(episode.rewards),
+                intrinsic_return=rounded(total(bonus)),
+                beta=rounded(beta),
+                terminated=int(episode.terminated),
+            )
         )
 
     def adapt(self, rollout: list[Experience]) -> float | None:

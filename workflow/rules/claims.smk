@@ -9,7 +9,7 @@ rule claims:
         claims=CLAIMS,
     output:
         json=f"{RESULTS}/claims.json",
-        markdown=report(f"{RESULTS}/claims.md", caption="../report/claims.rst", category="Results"),
+        markdown=shown("claims.md", "claims"),
     log:
         f"{RESULTS}/logs/claims.log",
     params:

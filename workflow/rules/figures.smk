@@ -7,14 +7,10 @@ rule figure:
         episodes=EPISODES,
         records=RECORDS,
     output:
-        curves=report(
-            f"{RESULTS}/figure{{number}}.csv", caption="../report/figure.rst", category="Results"
-        ),
+        curves=shown("figure{number}.csv", "figure"),
         single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
         pdf=f"{RESULTS}/figure{{number}}.pdf",
-        png=report(
-            f"{RESULTS}/figure{{number}}.png", caption="../report/figure.rst", category="Results"
-        ),
+        png=shown("figure{number}.png", "figure"),
     log:
         f"{RESULTS}/logs/figure{{number}}.log",
     wildcard_constraints:
@@ -40,9 +36,7 @@ rule picture:
     output:
         data=f"{RESULTS}/{{picture}}.csv",
         pdf=f"{RESULTS}/{{picture}}.pdf",
-        png=report(
-            f"{RESULTS}/{{picture}}.png", caption="../report/picture.rst", category="Results"
-        ),
+        png=shown("{picture}.png", "picture"),
     log:
         f"{RESULTS}/logs/{{picture}}.log",
     wildcard_constraints:
@@ -55,7 +49,6 @@ rule picture:
         "../scripts/picture.py"
 
 
-# Seconds of work that only Table 1 is worth.
 rule readings:
     input:
         records=RECORDS,
@@ -64,9 +57,7 @@ rule readings:
     output:
         data=f"{RESULTS}/readings.csv",
         pdf=f"{RESULTS}/readings.pdf",
-        png=report(
-            f"{RESULTS}/readings.png", caption="../report/picture.rst", category="Supplement"
-        ),
+        png=shown("readings.png", "picture", "Supplement"),
     log:
         f"{RESULTS}/logs/readings.log",
     params:

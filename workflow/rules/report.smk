@@ -1,5 +1,4 @@
-# One page of everything to read. Snakemake's own (`--report`) has the outputs one by one, with every
-# job's code and times, in an application that needs scripts; verdicts and agents at play it has not.
+# One page of everything to read; Snakemake's own (`--report`) has the outputs one by one.
 
 from mace_rl.sources import PACKAGE
 

@@ -48,10 +48,8 @@ RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
 FOLDERS = {folder_of(env): env for env in study.environments}
-EPISODES = [
-    f"{RUN}/{files.EPISODES}".format(env=folder_of(e), variant=v, seed=s) for e, v, s in RUNS
-]
-RECORDS = [path.replace(files.EPISODES, files.RECORD) for path in EPISODES]
+MADE = [RUN.format(env=folder_of(env), variant=name, seed=seed) for env, name, seed in RUNS]
+EPISODES, RECORDS = ([f"{run}/{file}" for run in MADE] for file in (files.EPISODES, files.RECORD))
 HAS_PAPERS = paper.table1.is_within(study.environments, study.variants)
 # What counts episodes can be read in several ways.
 COUNTED = [metric.name for metric in all_metrics(MEASURED) if metric.unit == "episodes"]
@@ -59,10 +57,9 @@ READ = ["readings"] if set(COUNTED) & set(paper.table1.metrics) else []
 # The ledger is for a study that has all that a family of claims is about.
 LACKING = paper.lacking(study.environments, study.variants, MEASURED)
 LEDGER = {} if all(LACKING.values()) else {"ledger": f"{RESULTS}/claims.json"}
-PICTURES = ["every_seed"]  # and what the configuration has the numbers for
-PICTURES += ["constants"] if MEASURED.constants else []
-PICTURES += ["solved"] if MEASURED.solved_return else []
-PICTURES += ["forest"] if LEDGER else []
+# Those that the configuration has the numbers for.
+DRAWN = {"constants": MEASURED.constants, "solved": MEASURED.solved_return, "forest": LEDGER}
+PICTURES = ["every_seed", *(picture for picture, numbers in DRAWN.items() if numbers)]
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 GIVEN = [option for option in options if not option.startswith("results=")]
 COMMAND = ["snakemake", "all"]
@@ -77,6 +74,11 @@ STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours":
 def csv(*names):
     """Data of the study, by the names of their files."""
     return {name: f"{RESULTS}/{name}.csv" for name in names}
+
+
+def shown(file, caption, category="Results"):
+    """An output that Snakemake's own report shows."""
+    return report(f"{RESULTS}/{file}", caption=f"../report/{caption}.rst", category=category)
 
 
 def one_of(values):
@@ -132,12 +134,11 @@ def queue_entry(wildcards):
 
 
 def code(script, settings=None):
-    """Digest of a script and of the code of mace_rl that it can use, for the `params:` of its rule.
+    """Digest of a script, of mace_rl and of the user's code in `settings`, for a rule's `params:`.
 
-    With `settings` that name code of the user's own (`references()`), of that too. A change of code,
-    by content, is thus a reason to run the job again. As an input it would not be: Snakemake goes by
-    an input's time stamp first, and records what it contained when the job ended, so code that was
-    edited meanwhile would pass for the code that ran.
+    A change of code is thus a reason to run the job again. As an input it would not be: Snakemake
+    goes by an input's time stamp first, and records what it contained when the job ended, so code
+    that was edited meanwhile would pass for the code that ran.
     """
     part = "training" if script == "train.py" else "everything"
     scripts = [Path(workflow.basedir, "workflow", "scripts", name) for name in (script, "job.py")]

@@ -18,22 +18,16 @@ rule metrics:
         "../scripts/metrics.py"
 
 
-SUPPLEMENT = {
-    name: report(f"{RESULTS}/{name}.csv", caption=f"../report/{name}.rst", category="Supplement")
-    for name in ("supplement", "comparisons", "aggregate")
-}
-
-
 rule tables:
     input:
         metrics=f"{RESULTS}/metrics.csv",
         claims=CLAIMS,
     output:
-        **SUPPLEMENT,
-        table1=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Results"),
-        table1_tex=report(
-            f"{RESULTS}/table1.tex", caption="../report/table1.rst", category="Results"
-        ),
+        supplement=shown("supplement.csv", "supplement", "Supplement"),
+        comparisons=shown("comparisons.csv", "comparisons", "Supplement"),
+        aggregate=shown("aggregate.csv", "aggregate", "Supplement"),
+        table1=shown("table1.csv", "table1"),
+        table1_tex=shown("table1.tex", "table1"),
     log:
         f"{RESULTS}/logs/tables.log",
     params:
@@ -48,7 +42,7 @@ rule table2:
     input:
         claims=CLAIMS,
     output:
-        report(f"{RESULTS}/table2.tex", caption="../report/table2.rst", category="Methods"),
+        shown("table2.tex", "table2", "Methods"),
     log:
         f"{RESULTS}/logs/table2.log",
     params:
@@ -69,7 +63,7 @@ rule tables_page:
         **LEDGER,
         claims=CLAIMS,
     output:
-        report(f"{RESULTS}/tables.md", caption="../report/tables.rst", category="Results"),
+        shown("tables.md", "tables"),
     log:
         f"{RESULTS}/logs/tables_page.log",
     params:

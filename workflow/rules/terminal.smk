@@ -114,15 +114,14 @@ onstart:
     for title, lacking in {} if LEDGER else LACKING.items():
         logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
     due = sum(run["due"] for run in planned["runs"])
-    logger.info(
-        f"{due} of {len(RUNS)} runs to train; how far they are: mace-rl status {RESULTS}"
-    )
+    to_train = f"{due} of {len(RUNS)} runs to train"
+    logger.info(f"{to_train}; how far they are: mace-rl status {RESULTS}")
 
 
 onsuccess:
     global LAST
     LAST += ("Elapsed time: ",)
-    for folder in {Path(episodes).parent for episodes in EPISODES}:
+    for folder in map(Path, MADE):
         # Not of an unfinished run, which was not asked for this time.
         if (folder / files.RECORD).exists():
             (folder / files.CHECKPOINT).unlink(missing_ok=True)

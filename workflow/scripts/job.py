@@ -22,9 +22,8 @@ logger = logging.getLogger("job")
 def job(snakemake: Any) -> Iterator[None]:
     """Carry out the body as the job that Snakemake's object of that name describes.
 
-    Standard output and error, those of compiled libraries too, are appended to the job's log. If
-    the body raises, the process exits with 1; then the log has the traceback and, in its last line,
-    which workflow/rules/terminal.smk shows, the reason.
+    All output, that of compiled libraries too, is appended to the job's log. If the body raises,
+    the process exits with 1, and the log ends with the reason, which terminal.smk shows.
     """
     title = " ".join([snakemake.rule, *snakemake.wildcards])
     # Without this a training goes on unseen when Snakemake is killed.

@@ -18,7 +18,9 @@ with job(snakemake):
     ppo = {env: PPOConfig.model_validate(own) for env, own in given.ppo.items()}
     records = [read_record(Path(record)) for record in found.records]
     made = report.Provenance(given.command, given.configuration, ppo, records)
-    runs = animations.first_seeds(given.runs, found.records)
-    films = animations.animations(runs, given.style["labels"], output.parent, given.own)
+    shown = {}  # by environment and variant the folder of the first seed
+    for (environment, variant, *_), record in zip(given.runs, found.records, strict=True):
+        shown.setdefault((environment, variant), Path(record).parent)
+    films = animations.animations(shown, given.style["labels"], output.parent, given.own)
     style = curves.plot_style(settings, **given.style)
     write_atomically(output, report.page(data, answers, paper, made, films, settings, style))

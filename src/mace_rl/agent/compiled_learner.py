@@ -4,6 +4,7 @@ It computes what `TorchLearner` does, with gradients written out. A minibatch go
 network in blocks that fit into the nearest cache: `products` continue the sum over steps.
 """
 
+import math
 from collections.abc import Mapping
 from typing import cast
 
@@ -40,7 +41,7 @@ class CompiledLearner(Stateful):
         rates["actor"] = config.actor_learning_rate
         self.parameters = parameters_of(policy, critics)
         self.optimisers = {
-            name: Adam(parameters, rates[name], config.max_gradient_norm)
+            name: Adam(parameters, rates[name], config.max_gradient_norm or math.inf)
             for name, parameters in self.parameters.items()
         }
 
@@ -53,7 +54,8 @@ class CompiledLearner(Stateful):
     ) -> Update:
         """As `Learner` says: each network goes through all epochs before the next one."""
         adam = {name: optimiser.state for name, optimiser in self.optimisers.items()}
-        sizes, loss = self.network.sizes, (self.config.clip, self.config.entropy_coefficient)
+        config, sizes = self.config, self.network.sizes
+        loss = config.clip, config.entropy_coefficient, config.learn_log_std
         norm, log_probs, entropies = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
         norms, seen = {"actor": norm}, batch.observations
         for kind, own in self.critics.items():
@@ -67,14 +69,17 @@ class CompiledLearner(Stateful):
         weights = np.stack([item / len(item) for item in advantages]).astype(np.float32)
         observations = np.ascontiguousarray(observations, np.float32)
         network, parameters = self.network, self.policy.parameters
-        return list(policy_gradients(observations, actions, weights, parameters, network.sizes))
+        found = policy_gradients(observations, actions, weights, parameters, network.sizes)
+        if not self.config.learn_log_std:
+            found[:, len(parameters) - len(self.policy.log_std) :] = 0
+        return list(found)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         return self.optimisers["actor"].preconditioned(direction)
 
 
 @kernel
-def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
+def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_log_std, adam):
     """Descend the clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
 
     steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
@@ -104,6 +109,8 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, adam):
                     outputs, log_std, done, weights, share * entropy_coefficient, own
                 )
                 backward(seen, activations, grad, back, sizes, gradient, scratch)
+            if not learn_log_std:
+                own[:] = 0
             norm = step(gradient, adam)
             first = end
     return norm, new_log_probs, entropies

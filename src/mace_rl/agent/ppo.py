@@ -78,13 +78,14 @@ class PPO(ActorCritic, Stateful):
         """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
 
         observations: normalised, [T + 1, observation]; rewards: [T], before scaling. The last state
-        is worth 0 if it is terminal, else what the critic says. The unit is `reward_scale`.
+        is worth 0 if it is terminal (with `bootstrap_at_time_limit` false always), else what the
+        critic says. The unit is `reward_scale`.
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
             rewards = rewards / self.reward_scale(kind)
         values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
-        if terminated:
+        if terminated or not self.config.bootstrap_at_time_limit:
             values[-1] = 0.0
         advantages = generalised_advantages(
             rewards, values, self.config.discount, self.config.gae_lambda

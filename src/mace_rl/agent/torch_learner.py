@@ -1,5 +1,6 @@
 """PPO in plain PyTorch: its losses (Schulman et al. 2017), autograd and `torch.optim.Adam`."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -26,6 +27,8 @@ class TorchLearner(Stateful):
         self.config = config
         self.parameters = parameters_of(policy, critics)
         self.actor = TorchPolicy(policy, validate=False)  # NaN is found in the gradients' norms
+        if not (self.actor.discrete or config.learn_log_std):
+            self.actor.log_std.register_hook(torch.zeros_like)
         self.policy_gradients = self.actor.gradients
         self.critics = {kind: critic.module() for kind, critic in critics.items()}
         self.weights = {"actor": self.actor.weights()}
@@ -61,7 +64,7 @@ class TorchLearner(Stateful):
                 loss, means = self.losses(Batch(*(part[chosen] for part in batch)), targets)
                 self.optimiser.zero_grad()
                 loss.backward()
-                most = self.config.max_gradient_norm
+                most = self.config.max_gradient_norm or math.inf
                 norms = {n: clip_grad_norm_(part, most).item() for n, part in self.weights.items()}
                 self.optimiser.step()
                 told += means.numpy() * len(chosen) / len(order)

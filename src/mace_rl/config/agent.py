@@ -41,7 +41,9 @@ class PPOConfig(Section):
     network: NetworkConfig = Field(default=CompiledNetwork(kind="mlp"), discriminator="kind")
     hidden_units: list[Units] = Field(min_length=1)
     initial_log_std: float = Field(ge=-10, le=2)  # Gaussian policies (Box actions) only
-    max_gradient_norm: PositiveFloat
+    learn_log_std: bool = True  # False: it stays as it began
+    clip_actions: bool = True  # to their bounds, before the environment gets them
+    max_gradient_norm: PositiveFloat | None  # None: gradients are not clipped
     normalise_observations: bool
     # Rewards are divided by the running standard deviation of their discounted sums; extrinsic ones
     # by at least 1, which does not amplify tiny costs.
@@ -51,6 +53,16 @@ class PPOConfig(Section):
     scale_advantages: bool
     smallest_advantage: PositiveFloat
     centre_advantages: bool  # subtract the rollout's mean from total advantages
+    bootstrap_at_time_limit: bool = True  # False: a state it cut off at is worth 0, like a last one
+    normalise_returns: bool = False  # in each episode, by their mean and the total ones' deviation
+
+    @model_validator(mode="after")
+    def _units_agree(self) -> "PPOConfig":
+        # A critic of normalised returns knows none as it was paid, so it may be part of none.
+        if self.normalise_returns and (self.gae_lambda < 1 or self.bootstrap_at_time_limit):
+            right = "gae_lambda: 1.0 and bootstrap_at_time_limit: false"
+            raise ValueError(f"normalise_returns goes with {right}")
+        return self
 
     @model_validator(mode="before")
     @classmethod

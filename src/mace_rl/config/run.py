@@ -4,7 +4,9 @@
 it, says what each means and may be. Equal `RunConfig`s and equal code give equal results.
 """
 
+import json
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any, Literal
 
 from pydantic import Field, PositiveInt, model_validator
@@ -12,7 +14,8 @@ from pydantic import Field, PositiveInt, model_validator
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.beta import BetaConfig, MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
-from mace_rl.config.section import Arguments, Section
+from mace_rl.config.published import COMPUTED, PublishedConfig
+from mace_rl.config.section import Arguments, Section, short_repr
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
@@ -30,8 +33,10 @@ class AgentConfig(Section):
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
     environment_arguments: Arguments = Field(default={})  # for the environment's constructor
+    trainer: Literal["published"] | None = None  # `mace_rl.published`; None: `mace_rl.trainer`
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
+    published: PublishedConfig | None = None
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
 
 
@@ -54,9 +59,24 @@ class RunConfig(AgentConfig):
     def _only_what_is_used(cls, values: Any) -> Any:
         if not isinstance(values, dict):
             return values
+        if values.get("trainer") == "published":
+            return {"published": {}} | values
         unused = unused_sections(values)
         values = {"bonus": {"kind": "curiosity"}} | values
         return {key: value for key, value in values.items() if key not in unused}
+
+    @model_validator(mode="after")
+    def _what_its_trainer_computes(self) -> "RunConfig":
+        for key, value in (COMPUTED if self.trainer else {"published": None}).items():
+            if (found := attrgetter(key)(self)) != value:
+                wanted = json.dumps(getattr(value, "module", value))
+                raise ValueError(
+                    f"{key} is {short_repr(found)}, but should be {wanted} with "
+                    f"trainer: {self.trainer or 'null'}"
+                )
+        if self.trainer and self.beta.kind == "custom":
+            raise ValueError("beta.kind is 'custom', which trainer: published does not know")
+        return self
 
     @model_validator(mode="after")
     def _all_that_is_used(self) -> "RunConfig":
@@ -91,6 +111,8 @@ def unused_sections(settings: Any) -> dict[str, str]:
             found = found.get(key) if of_mapping else getattr(found, key, None)
         return found
 
+    if value("trainer") == "published":
+        return dict.fromkeys((*BONUS_SECTIONS, "meta"), "trainer 'published'")
     beta, bonus = value("beta", "kind"), value("bonus", "kind")
     if beta == "none":
         return dict.fromkeys((*BONUS_SECTIONS, "meta"), "beta.kind 'none'")

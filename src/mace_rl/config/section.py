@@ -93,6 +93,8 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         case _:
             reason = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
             reason = " ".join(reason.replace(" after validation, not 0", "").split())
+            if not problem["loc"]:  # of several keys together, which the reason names
+                return reason
             return f"{key} is {short_repr(problem['input'])}, but {reason}{_advice(problem)}"
 
 

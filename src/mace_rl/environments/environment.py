@@ -66,6 +66,8 @@ class Environment(Spaces):
     error in making or resetting it, a missing time limit and unsupported spaces.
     """
 
+    clips_actions = True  # Box ones to their bounds
+
     def __init__(
         self,
         name: str,

@@ -57,7 +57,9 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     while not (terminated or truncated):
         action: Any
         action, log_prob = policy.act(observations[t], noise[t])
-        env_action = action + int(space.start) if discrete else action.clip(space.low, space.high)
+        env_action = action + int(space.start) if discrete else action
+        if not discrete and environment.clips_actions:
+            env_action = action.clip(space.low, space.high)
         observation, reward, terminated, truncated = environment.step(env_action, t + 1)
         actions[t], log_probs[t], rewards[t] = action, log_prob, reward
         t += 1

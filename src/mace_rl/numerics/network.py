@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from torch.nn.utils import skip_init
 
 from mace_rl.numerics import network_kernels as kernels
 from mace_rl.numerics.products import padded
@@ -145,8 +144,10 @@ def tanh_layers(parameters: Iterable[tuple[np.ndarray, np.ndarray]]) -> torch.nn
     """The torch module of `mlp` from each layer's weights, [in, out], and biases."""
     layers: list[torch.nn.Module] = []
     for weights, biases in parameters:
-        # `skip_init`: a new layer would draw weights, from the global generator.
-        layer = skip_init(torch.nn.Linear, *weights.shape, device="cpu", dtype=torch.float32)
+        generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
+        inputs, outputs = weights.shape
+        layer = torch.nn.Linear(inputs, outputs, device="cpu", dtype=torch.float32)
+        torch.set_rng_state(generator)
         with torch.no_grad():
             layer.weight.copy_(torch.from_numpy(weights.T))
             layer.bias.copy_(torch.from_numpy(biases))

@@ -14,7 +14,7 @@ from gymnasium.spaces import Space
 from torch import Tensor
 from torch.distributions import Distribution
 
-from mace_rl import files
+from mace_rl import files, published
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
@@ -88,7 +88,11 @@ class Player:
     def __init__(self, config: AgentConfig) -> None:
         streams = Streams(config.seed)
         self.environment = environment(config, streams)
-        self.networks = actor_critic(config, self.environment, config.bonus is not None, streams)
+        if config.trainer == "published":
+            self.networks = published.networks(config, self.environment, streams)
+        else:
+            bonus = config.bonus is not None
+            self.networks = actor_critic(config, self.environment, bonus, streams)
         self.agent = Agent(self.networks, self.environment.given_space)
 
     @classmethod

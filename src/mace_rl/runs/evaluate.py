@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from mace_rl.environments.rollout import draw_noise, rollout_for
 from mace_rl.numerics.arrays import total
@@ -24,7 +25,9 @@ def evaluate(
     generator = np.random.default_rng(seed)
     environment.env.reset(seed=seed)
     returns = np.empty(episodes)
-    for episode in range(episodes):
-        played = rollout(environment, policy, draw_noise(environment, generator))
-        returns[episode] = total(played.rewards)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)  # for a network with dropout
+        for episode in range(episodes):
+            played = rollout(environment, policy, draw_noise(environment, generator))
+            returns[episode] = total(played.rewards)
     return returns

@@ -22,6 +22,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
+from mace_rl.published import PublishedTrainer
 from mace_rl.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint, provenance
@@ -70,7 +71,7 @@ def run(
             return
         started = time.monotonic()
         identity = provenance.identity(config)
-        trainer = Trainer(config)
+        trainer = (PublishedTrainer if config.trainer == "published" else Trainer)(config)
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:

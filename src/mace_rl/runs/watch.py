@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl.config.section import ConfigError
@@ -126,9 +127,11 @@ def film(
         environment = Environment(config.environment, seeds, limit, drawn)
     except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
+    environment.clips_actions = config.ppo.clip_actions
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
-    with closing(filmed), nothing_printed():
+    with closing(filmed), nothing_printed(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)  # as `evaluate` does
         filmed.unwrapped.reset(seed=seed)
         for _ in range(episodes):
             roll_out(environment, policy, draw_noise(environment, generator))

@@ -1,12 +1,7 @@
-"""What a paper says, and what is asked of one's own: the file that `claims` in config.yaml names.
-
-Claims in families, each claim in parts that `compare.verdicts` judges; the paper's tables; and what
-all of it is called. `read_claims` checks the file against the study that names it.
-"""
+"""What a paper says, and what we ask ourselves: the file that `claims` in config.yaml names."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -70,9 +65,9 @@ class Table1Config(Section):
 
 
 class Table2Config(Section):
-    """The paper's Table 2; both by the settings of `ppo`."""
+    """The paper's Table 2: labels by the setting of `ppo`."""
 
-    rows: dict[str, str] = Field(default={})  # what they are called there
+    rows: dict[str, str] = Field(default={})  # what the paper has
     others: dict[str, str] = Field(default={})  # what the paper leaves open
 
 
@@ -93,20 +88,14 @@ class PartsConfig(Section):
 
     def each(self, table1: Table1Config) -> list[Part]:
         """The parts: environment by environment, in each the variants that it is over."""
-        groups = [self.environments] if self.together else [[env] for env in self.environments]
-        others: list[str | None] = [*self.over] or [None]
-        own = self.metric, self.variant
-        return [
-            Part(tuple(group), *own, other, self._in_paper(group, other, table1))
-            for group in groups
-            for other in others
-        ]
-
-    def _in_paper(self, group: list[str], other: str | None, table1: Table1Config) -> float:
-        values = table1.values_of(group, self.metric)
-        if self.variant in values and other in values:
-            return float(values[self.variant] - values[other])
-        return math.nan
+        parts = []
+        for group in [self.environments] if self.together else [[env] for env in self.environments]:
+            paper = table1.values_of(group, self.metric)
+            for other in self.over or [""]:
+                in_paper = float(paper.get(self.variant, math.nan) - paper.get(other, math.nan))
+                own = self.metric, self.variant, other or None
+                parts.append(Part(tuple(group), *own, in_paper))
+        return parts
 
 
 class ClaimConfig(Section):
@@ -119,7 +108,7 @@ class ClaimConfig(Section):
 
 
 class WordsConfig(Section):
-    """What each kind of answer is called."""
+    """A family's word for each verdict."""
 
     shown: str
     reversed: str
@@ -154,23 +143,20 @@ class ClaimsConfig(Section):
     def lacking(
         self, environments: Iterable[str], variants: Iterable[str], settings: MetricsConfig
     ) -> dict[str, list[str]]:
-        """By family, what a study of these lacks for the family's parts: nothing, if it is asked.
+        """By family, what its parts need and a study of these lacks: if nothing, it is judged.
 
         Parts of returns have their margin by `metrics.reference_return` of their environments.
         """
-        has = {*environments, *variants, *CORRELATIONS}.union(m.name for m in all_metrics(settings))
+        goal = "metrics.reference_return.{}".format
+        has = {*environments, *variants, *CORRELATIONS, *map(goal, settings.reference_return)}
+        has.update(metric.name for metric in all_metrics(settings))
         found = {}
         for title, family in self.families.items():
-            parts = [part for _, part in parts_of(family)]
-            needed = [[*one.environments, one.variant, *one.over, one.metric] for one in parts]
-            goals = [env for one in parts for env in one.environments]
-            names = [name for name in chain.from_iterable(needed) if name not in has]
-            names += [
-                f"metrics.reference_return.{env}"
-                for env in goals
-                if env in has and env not in settings.reference_return
-            ]
-            found[title] = list(dict.fromkeys(names))
+            needed, goals = [], []
+            for _, one in parts_of(family):
+                needed += [*one.environments, one.variant, *one.over, one.metric]
+                goals += [goal(env) for env in one.environments if env in has]
+            found[title] = [name for name in dict.fromkeys([*needed, *goals]) if name not in has]
         return found
 
 

@@ -1,7 +1,6 @@
 """The study: which runs there are, with which hyperparameters, and how they are evaluated.
 
-`config.yaml`, with the files read over it, is checked here as a whole before any job starts. This
-module is imported whenever the workflow is planned, so it stays clear of torch and numba.
+Planning the workflow imports this module, so it stays clear of torch and numba.
 """
 
 import importlib.util
@@ -61,10 +60,7 @@ def _once(values: list[Any]) -> list[Any]:
 
 
 class Variant(Section):
-    """One variant: what sets its β, what else differs, and how it is shown.
-
-    Whatever else stands here goes over `training` and the environment's settings.
-    """
+    """One variant: how it is shown; its settings go over `training` and the environment's."""
 
     model_config = Section.model_config | {"extra": "allow"}
 
@@ -149,20 +145,15 @@ class Study(Section):
 
 
 def load_study(config: Mapping[Any, Any], origin: str) -> Study:
-    """Check a configuration as a whole, every run's settings included.
-
-    `origin` (file names) starts the message of the `ConfigError`, one line with the key, the value
-    and what would be right, that the first mistake raises.
-    """
+    """Check a configuration, every run's settings included; `origin` begins a `ConfigError`."""
     from matplotlib.colors import is_color_like
 
     study = check(Study, {str(key): value for key, value in config.items()}, origin)
     try:
         for variant in study.variants:
             check_known(variant, study.variant_settings, "variants", "variant_settings")
-        for variant in study.variant_settings:
-            _check_name(variant, "variant_settings")
         for variant, shown in study.variant_settings.items():
+            _check_name(variant, "variant_settings")
             if shown.colour is not None and not is_color_like(shown.colour):
                 raise ConfigError(
                     f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"
@@ -170,9 +161,7 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
                 )
         [(label, count)] = Counter(study.labels.values()).most_common(1)
         if count > 1:
-            raise ConfigError(
-                f"{count} variants have the label {label!r}; each should have its own"
-            )
+            raise ConfigError(f"{count} variants have the label {label!r}; each needs its own")
         for variant in itertools.chain.from_iterable(study.metrics.comparisons):
             check_known(variant, study.variant_settings, "metrics.comparisons", "variant_settings")
         known = dict.fromkeys([*study.environments, *study.environment_settings])
@@ -201,9 +190,8 @@ def folder_of(environment: str) -> str:
 def read_study(paths: Sequence[Path], every_run: bool = True) -> Study:
     """The study of one YAML file and others read over it: mappings merge, lists are replaced.
 
-    Without `every_run` each is checked when it is asked for, and packages that others need may be
-    missing. Raises `ConfigError` for a file that cannot be read or is not a mapping, a key that a
-    file gives twice, and everything that `load_study` refuses.
+    Without `every_run` each run is checked when it is asked for, and packages that others need may
+    be missing. Raises `ConfigError` as `read_yaml` and `load_study` do.
     """
     config: Settings = reduce(merge, map(read_yaml, paths), {})
     origin = " + ".join(str(path) for path in paths)
@@ -219,7 +207,6 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
     }
     if changes:
         layers["the changes"] = changes
-    settings: Settings = {}
     for name, layer in layers.items():
         for key in IDENTITY:
             if key in layer:
@@ -227,7 +214,7 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
                     f"{name}.{key} is {short_repr(layer[key])}, but the lists environments, "
                     "variants and seeds say which runs there are"
                 )
-        settings = merge_layers(settings, layer)
+    settings = reduce(merge_layers, layers.values())
     settings |= {"environment": environment, "variant": variant, "seed": 0}
     _check_name(environment, "environment")
     try:

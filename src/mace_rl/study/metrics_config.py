@@ -63,8 +63,7 @@ class MetricsConfig(Section):
     def incomplete(self, environments: Sequence[str], variants: Sequence[str]) -> list[str]:
         """A line for whatever `within` leaves out for want of some environments or variants."""
         lines = []
-        for key in GOALS:
-            goal = getattr(self, key)
+        for key, goal in zip(GOALS, self.goals, strict=True):
             missing = [name for name in environments if name not in goal]
             if missing and len(missing) < len(environments):
                 lines.append(f"metrics.{key} is left out: it has nothing for {', '.join(missing)}")
@@ -74,23 +73,20 @@ class MetricsConfig(Section):
         return lines
 
     def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
-        """These settings for a study of these environments and variants.
+        """These settings for a study of these; what `incomplete` names is left out.
 
-        Of `GOALS`, what not every environment has is left out, and `constants` without one of its
-        variants (see `incomplete`). Raises `ConfigError` for a goal that random actions attain.
+        Raises `ConfigError` for a goal that random actions attain.
         """
         left: dict[str, Any] = {}
-        for key in GOALS:
-            given = {
-                name: value for name, value in getattr(self, key).items() if name in environments
-            }
-            for name, value in given.items():
+        for key, goal in zip(GOALS, self.goals, strict=True):
+            left[key] = {name: value for name, value in goal.items() if name in environments}
+            for name, value in left[key].items():
                 if value <= self.random_return_in(name):
                     raise ConfigError(
                         f"metrics.{key}.{name} is {value!r}, but should be greater than"
                         f" metrics.random_return.{name}, {self.random_return[name]!r}"
                     )
-            left[key] = given if len(given) == len(environments) else {}
+            left[key] = left[key] if len(left[key]) == len(environments) else {}
         if not set(variants).issuperset(self._constant_variants()):
             left["constants"] = None
         return self.model_copy(update=left)

@@ -35,9 +35,8 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     environment has one seed. Every environment weighs as much as it has runs.
     """
     rows, repetitions = [], settings.bootstrap_repetitions
-    for (metric, variant), runs in scores(table, settings).groupby(
-        ["metric", "variant"], sort=False
-    ):
+    groups = scores(table, settings).groupby(["metric", "variant"], sort=False)
+    for (metric, variant), runs in groups:
         strata = [group["score"].to_numpy() for _, group in runs.groupby("env", sort=False)]
         smallest = min(len(values) for values in strata)
         generator = np.random.default_rng(settings.bootstrap_seed)

@@ -7,12 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from mace_rl.study.compare.statistics import (
-    holm,
-    logrank,
-    paired_comparison,
-    probability_of_improvement,
-)
+from mace_rl.study.compare import statistics
 from mace_rl.study.measure.metrics import Metric, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 
@@ -61,7 +56,7 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         rows.extend(chain.from_iterable(zip(*compared, strict=True)))  # metric by metric
     frame = pd.DataFrame(rows, columns=Comparison._fields)
     tested = frame["p_value"].notna()
-    frame.loc[tested, "p_holm"] = holm(frame.loc[tested, "p_value"].to_list())
+    frame.loc[tested, "p_holm"] = statistics.holm(frame.loc[tested, "p_value"].to_list())
     return frame
 
 
@@ -84,9 +79,8 @@ def _compare(
         x, y = (_reached(own, metrics, budget) for own in both)
         reached.append((x, y))
         restricted.append((np.where(np.isinf(x), budget, x), np.where(np.isinf(y), budget, y)))
-    better = probability_of_improvement(
-        [(x * signs, y * signs) for x, y in restricted], *how, np.random.default_rng(seed)
-    )
+    signed = [(x * signs, y * signs) for x, y in restricted]
+    better = statistics.probability_of_improvement(signed, *how, np.random.default_rng(seed))
     censored = sum(np.isinf(values).sum(axis=0) for both in reached for values in both)
     seeds = min(len(x) for x, _ in reached)
     rows = [
@@ -96,12 +90,13 @@ def _compare(
     if len(environments) > 1:
         return rows
     [environment], [(x, y)], [events] = environments, restricted, reached
-    compared = paired_comparison(x - y, *how, np.random.default_rng(seed))
+    compared = statistics.paired_comparison(x - y, *how, np.random.default_rng(seed))
     for place, (metric, *found) in enumerate(zip(metrics, *compared, strict=True)):
         test = "sign-flip"
         if metric.unit == "episodes":
             mine, theirs = (values[:, place] for values in events)
-            test, found[-1] = "log-rank", logrank(mine, theirs, how[1], np.random.default_rng(seed))
+            test, seeded = "log-rank", np.random.default_rng(seed)
+            found[-1] = statistics.logrank(mine, theirs, how[1], seeded)
         difference, low, high, p_value = found
         rows[place] = rows[place]._replace(
             env=environment, difference=difference, low=low, high=high, test=test, p_value=p_value

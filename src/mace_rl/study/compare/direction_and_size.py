@@ -1,7 +1,4 @@
-"""The second rule of verdicts: direction and size apart (docs/metrics.md, "The second rule").
-
-Is there a difference, is it worth mentioning, does the paper's agree, and was there room for one?
-"""
+"""The second rule of verdicts: direction and size apart (docs/metrics.md, "The second rule")."""
 
 from dataclasses import asdict, replace
 
@@ -49,10 +46,10 @@ def decided(part: SizedFinding) -> SizedFinding:
 
 
 def by_chance(differences: np.ndarray) -> float:
-    """How far our mean may lie from the difference of one run each, if only chance parts them.
+    """Half a prediction interval for the difference of one run each; NaN with one seed.
 
-    Half a prediction interval (Spence and Stanley 2016; Patil, Peng and Leek 2016): a difference of
-    one run each varies by our σ², the mean of our n by σ² / n. NaN with one seed.
+    Such a difference varies by our σ², our mean of n by σ² / n (Spence and Stanley 2016; Patil,
+    Peng and Leek 2016).
     """
     seeds = len(differences)
     if seeds == 1:

@@ -15,7 +15,7 @@ from mace_rl.study.compare.statistics import (
     probability_of_improvement,
     stratified_comparison,
 )
-from mace_rl.study.measure.metrics import Metric, all_metrics
+from mace_rl.study.measure.metrics import Metric, all_metrics, metric_units
 from mace_rl.study.metrics_config import MetricsConfig
 
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
@@ -52,8 +52,8 @@ def pairs_of(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> list[P
 
 def find(part: Part, pairs: Sequence[Pair], margin: float, settings: MetricsConfig) -> Finding:
     """Estimates and tests of one part; `margin` is the smallest difference worth mentioning."""
-    units: dict[str, str] = {metric.name: metric.unit for metric in all_metrics(settings)}
-    unit = "share of everything" if len(pairs) > 1 else units.get(part.metric, "correlation")
+    unit = metric_units(settings).get(part.metric, "correlation")
+    unit = "share of everything" if len(pairs) > 1 else unit
     differences = [pair.variant - pair.baseline for pair in pairs]
     how = CONFIDENCE, settings.bootstrap_repetitions
     seed = settings.bootstrap_seed
@@ -62,17 +62,16 @@ def find(part: Part, pairs: Sequence[Pair], margin: float, settings: MetricsConf
     difference, low, high, p_value = map(float, compared)
     improved = probability_of_improvement(columns, *how, np.random.default_rng(seed))
     chance, lowest, highest = (bound.item() for bound in improved)
-    flips = settings.bootstrap_repetitions, np.random.default_rng(seed)
     return Finding(
         *part[:4],
         unit,
-        min(len(difference) for difference in differences),
+        min(map(len, differences)),
         *(difference, low, high, p_value),
         *(chance, lowest, highest),
         _detectable(differences),
         margin,
         -part.in_paper if unit == "episodes" else part.in_paper,
-        equivalence(differences, margin, *flips),
+        equivalence(differences, margin, how[1], np.random.default_rng(seed)),
     )
 
 
@@ -104,7 +103,7 @@ def _pair(part: Part, runs: pd.DataFrame, metric: Metric | None, settings: Metri
 
 def _detectable(differences: Sequence[np.ndarray]) -> float:
     """The smallest mean difference that is significant with a probability of `POWER`."""
-    if min(len(values) for values in differences) == 1:
+    if min(map(len, differences)) == 1:
         return np.nan
     freedom = sum(len(values) - 1 for values in differences)
     variances = [np.var(values, ddof=1) / len(values) for values in differences]

@@ -1,11 +1,11 @@
 """What decides the ranking: Table 1 under every reading of its two metrics (docs/metrics.md).
 
-Beside the runs as they are stand the same runs with their returns in random order. Whoever is first
-there is first by chance and by how returns are distributed, since nothing is learned in that order.
+Beside the runs stand the same runs with their returns in random order, in which nothing is learned.
 """
 
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,10 +25,7 @@ LEVEL = 0.05  # of the log-rank test that the first is really ahead
 
 
 def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metric]]:
-    """Every reading with the one of the paper's metrics that it reads, in the order of tables.
-
-    Only what counts episodes can be read in several ways.
-    """
+    """Every reading, in episodes, with the one of the paper's metrics that it reads."""
     both = itertools.product(table1.metrics, all_metrics(settings))
     return [
         (kind, one) for kind, one in both if one.unit == "episodes" and one.name.startswith(kind)
@@ -39,9 +36,9 @@ def shuffled(
     frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig
 ) -> dict[RunKey, pd.DataFrame]:
     """The same runs, the returns of each in random order."""
-    generator = np.random.default_rng(settings.bootstrap_seed)
+    mixed = np.random.default_rng(settings.bootstrap_seed).permutation
     return {
-        run: frame.assign(extrinsic_return=generator.permutation(frame["extrinsic_return"]))
+        run: frame.assign(extrinsic_return=mixed(frame["extrinsic_return"]))
         for run, frame in frames.items()
     }
 
@@ -66,12 +63,10 @@ def readings(
             parts.append(_published(environment, kind, list(frames), table1))
         for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
             if source == RUNS or metric.name in table1.shuffled:
-                table, own = means[source], runs[source]
-                rows = table[(table["env"] == environment) & (table["metric"] == metric.name)]
-                own = own[own["env"] == environment]
-                parts.append(
-                    _measured(rows, own, metric, settings).assign(kind=kind, source=source)
-                )
+                both = means[source], runs[source]
+                rows, own = (table[table["env"] == environment] for table in both)
+                rows = _measured(rows[rows["metric"] == metric.name], own, metric, settings)
+                parts.append(rows.assign(kind=kind, source=source))
     table = pd.concat(parts).rename(columns={"metric": "reading"})
     return table[COLUMNS].reset_index(drop=True)
 
@@ -80,13 +75,9 @@ def _published(
     environment: str, kind: str, runs: Sequence[RunKey], table1: Table1Config
 ) -> pd.DataFrame:
     """The numbers of the paper's Table 1, of the variants that are there."""
-    variants = dict.fromkeys(variant for _, variant, _ in runs)
-    values = {
-        name: float(value)
-        for name in variants
-        if (value := table1.value(environment, name, kind)) is not None
-    }
-    rows = pd.DataFrame({"variant": list(values), "mean": list(values.values())})
+    variants = list(dict.fromkeys(variant for _, variant, _ in runs))
+    values = [table1.value(environment, name, kind) for name in variants]
+    rows = pd.DataFrame({"variant": variants, "mean": np.array(values, np.float64)}).dropna()
     rows = rows.assign(env=environment, kind=kind, metric=kind, source=PAPER, low=np.nan)
     rows = rows.assign(high=np.nan, seeds=0, censored=0, p_value=np.nan)
     return rows.assign(rank=rows["mean"].rank(method="min").astype(int))
@@ -114,21 +105,14 @@ def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str
     """A reading as a row of the table or the figure is called; `names` are the metrics' labels."""
     if source == PAPER:
         return f"{names[kind]}: the paper's Table 1"
-    if source == SHUFFLED:
-        return f"{names[reading]}, returns shuffled"
-    return names[reading]
+    return names[reading] + (", returns shuffled" if source == SHUFFLED else "")
 
 
 def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFrame]]:
     """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
-    found = [
-        ((str(kind), str(reading), str(source)), rows)
-        for (kind, reading, source), rows in table.groupby(
-            ["kind", "reading", "source"], sort=False
-        )
-    ]
-    order = list(table["kind"].unique()), [PAPER, RUNS, SHUFFLED]
-    return sorted(found, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
+    order = [*table["kind"].unique()], [PAPER, RUNS, SHUFFLED]
+    lines: Any = table.groupby(["kind", "reading", "source"], sort=False)
+    return sorted(lines, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
 
 
 def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:

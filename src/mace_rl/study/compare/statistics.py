@@ -1,14 +1,10 @@
-"""Statistics over seeds: estimates, intervals and comparisons.
+"""Statistics over seeds, of float64 arrays [seeds], after Agarwal et al. 2021 (docs/metrics.md).
 
-Pure functions of float64 arrays of shape [seeds]; whatever draws random numbers takes the generator
-that it draws them from. An interval is a pair (low, high), both NaN where one seed allows none.
-After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
+An interval is a pair (low, high), both NaN where one seed allows none.
 """
 
-import json
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # loads what is used of it when it is: scipy.stats alone takes a second
@@ -18,6 +14,7 @@ from mace_rl.study.metrics_config import MetricsConfig
 BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
 CHUNK = 2**20  # resampled values held in memory at a time
 BATCH = 1000  # resamples of a test at a time: faster than all 10000, which caches cannot hold
+REMEMBERED = 64  # draws: some MB each
 
 
 class PairedComparison(NamedTuple):
@@ -75,9 +72,9 @@ def paired_comparison(
     """
     mean = np.mean(differences, axis=0)
     low, high = mean_interval(differences, confidence, repetitions, generator)
-    if len(differences) == 1:
-        return PairedComparison(mean, low, high, np.full_like(mean, np.nan))
-    return PairedComparison(mean, low, high, _sign_flips(differences, repetitions, generator))
+    one = len(differences) == 1
+    p = np.full_like(mean, np.nan) if one else _sign_flips(differences, repetitions, generator)
+    return PairedComparison(mean, low, high, p)
 
 
 def equivalence(
@@ -88,9 +85,8 @@ def equivalence(
 ) -> float:
     """p value that the mean over strata of the mean difference is not within ± `margin`.
 
-    Two one-sided sign-flip tests (Schuirmann 1987), that it is above -margin and that it is below
-    margin: the larger of their p values. differences: as of `stratified_comparison`. NaN with one
-    seed in a stratum.
+    The larger p value of two one-sided sign-flip tests (Schuirmann 1987), that it is above -margin
+    and that it is below margin; NaN with one seed in a stratum.
     """
     if min(map(len, differences)) == 1:
         return np.nan
@@ -115,10 +111,8 @@ def _sign_flips(
 
 def _weighted(differences: Sequence[np.ndarray]) -> np.ndarray:
     """The differences of all strata, weighted: their mean is the mean of the strata's means."""
-    total = sum(len(values) for values in differences)
-    return np.concatenate(
-        [values * total / (len(differences) * len(values)) for values in differences]
-    )
+    total, count = sum(map(len, differences)), len(differences)
+    return np.concatenate([values * total / (count * len(values)) for values in differences])
 
 
 def stratified_comparison(
@@ -129,14 +123,13 @@ def stratified_comparison(
 ) -> PairedComparison:
     """The mean over strata (environments) of the mean paired difference, [seeds] in each.
 
-    The bootstrap resamples, and the sign-flip test flips, within the strata. With fewer than 10
-    seeds in one of them the interval is Student's t with the degrees of freedom of the smallest.
-    With one stratum: `paired_comparison`.
+    The bootstrap resamples within the strata. With fewer than 10 seeds in one of them the interval
+    is Student's t with the degrees of freedom of the smallest.
     """
     if len(differences) == 1:
         return paired_comparison(differences[0], confidence, repetitions, generator)
     tested = paired_comparison(_weighted(differences), confidence, repetitions, generator)
-    smallest = min(len(values) for values in differences)
+    smallest = min(map(len, differences))
     if smallest == 1:
         return tested._replace(low=np.array(np.nan), high=np.array(np.nan))
     if interval_kind(smallest) == "t":
@@ -144,9 +137,7 @@ def stratified_comparison(
         error = np.sqrt(np.sum(errors)) / len(differences)
         half = scipy.special.stdtrit(smallest - 1, (1 + confidence) / 2) * error
         return tested._replace(low=tested.difference - half, high=tested.difference + half)
-    means = [
-        draws(len(values), repetitions, generator) @ values / len(values) for values in differences
-    ]
+    means = [draws(len(own), repetitions, generator) @ own / len(own) for own in differences]
     low, high = percentiles(np.mean(means, axis=0), confidence, smallest)
     return tested._replace(low=low, high=high)
 
@@ -157,10 +148,9 @@ def logrank(
     """Two-sided p value of the log-rank test that x [n] and y [m] come from the same distribution.
 
     Episodes at which something was reached, np.inf where it never was (censored at the end of
-    training). From the permutation distribution of observed minus expected events: exact while
-    there are ≤ `repetitions` ways to choose n of n + m, else of that many random ones. (The usual
-    normal approximation gives 0.025 for three runs all later than three others; it is 0.1.) NaN
-    with one run of each.
+    training). By permutations of observed minus expected events: all of them while there are
+    ≤ `repetitions`, else so many random ones. (The normal approximation gives 0.025 for three runs
+    all later than three others; it is 0.1.) NaN with one run of each.
     """
     times, reached = np.concatenate([x, y]), np.isfinite(np.concatenate([x, y]))
     if len(times) == 2:
@@ -194,8 +184,8 @@ def probability_of_improvement(
     """P(X > Y) + P(X = Y) / 2 for one run of each, and the bounds of its bootstrap interval.
 
     Each is [metrics], the mean over `pairs` (x [n, metrics], y [m, metrics]), one for each
-    environment. All x and y are unpaired and resampled independently; the same draws serve every
-    metric. *Greater* is the improvement: pass the negative of a metric of which lower is better.
+    environment. x and y are resampled independently, the same draws for all metrics. Greater is
+    better.
     """
     metrics = pairs[0][0].shape[1]
     means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
@@ -226,22 +216,21 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
 def _remembered(
     draw: Callable[[int, int, np.random.Generator], np.ndarray],
 ) -> Callable[[int, int, np.random.Generator], np.ndarray]:
-    """`draw`, which most rows of a table call with equal generators, drawing only once for each.
+    """`draw` with a memory: most rows of a table draw the same, from equal generators.
 
     The generator moves on as if it had been drawn from.
     """
-
-    @lru_cache(maxsize=64)
-    def drawn(first: int, second: int, state: str) -> tuple[np.ndarray, str]:
-        generator = np.random.default_rng()
-        generator.bit_generator.state = json.loads(state)
-        values = draw(first, second, generator)
-        values.flags.writeable = False
-        return values, json.dumps(generator.bit_generator.state)
+    drawn: dict[tuple[int, int, str], tuple[np.ndarray, Mapping[str, Any]]] = {}
 
     def again(first: int, second: int, generator: np.random.Generator) -> np.ndarray:
-        values, after = drawn(first, second, json.dumps(generator.bit_generator.state))
-        generator.bit_generator.state = json.loads(after)
+        key = first, second, repr(generator.bit_generator.state)
+        if key not in drawn:
+            if len(drawn) == REMEMBERED:
+                drawn.clear()
+            values = draw(first, second, generator)
+            values.flags.writeable = False
+            drawn[key] = values, generator.bit_generator.state
+        values, generator.bit_generator.state = drawn[key]
         return values
 
     return again
@@ -268,10 +257,9 @@ def orders(repetitions: int, count: int, generator: np.random.Generator) -> np.n
 def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndarray:
     """The bounds [2, …] of a bootstrap interval from `estimates` [repetitions, …], used up by it.
 
-    The percentiles that leave out equal tails, moved outward as much as Student's t is wider than
-    the normal distribution with so few `seeds` (Hesterberg 2015, the expanded percentile interval):
-    a bootstrap over 10 seeds is too narrow otherwise (docs/metrics.md). With one seed, and
-    where one of `estimates` is NaN, NaN.
+    The expanded percentile interval (Hesterberg 2015): percentiles moved outward as much as
+    Student's t is wider than the normal distribution with so few `seeds`, over which a bootstrap is
+    too narrow otherwise (docs/metrics.md). NaN with one seed, and where one of `estimates` is NaN.
     """
     if seeds == 1:
         return np.full((2, *estimates.shape[1:]), np.nan)

@@ -19,11 +19,9 @@ COLUMNS += ["paper"]  # of table1.csv and supplement.csv
 def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) -> pd.DataFrame:
     """All metrics averaged over seeds; `table` is the frame of metrics.csv, `table1` the paper's.
 
-    One row per environment, variant and metric, in the order of `table`: `mean`,
-    the bounds `low` and `high` of its interval (NaN with one seed; cut to where its mean must lie,
-    [1, E] for a metric in episodes and [0, 1] for a share), the number of `seeds`, how many of them
-    are `censored` (counted with E, so the mean is a lower bound), the budget E in `episodes`, and
-    the `paper`'s value (missing where it has none).
+    One row per environment, variant and metric, in the order of `table`. The interval (NaN with one
+    seed) is cut to where the mean must lie. `censored`: how many of the seeds count with the budget
+    E, so that the mean is a lower bound. `episodes`: E. `paper`: its value, if it has one.
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):

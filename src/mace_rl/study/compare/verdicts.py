@@ -1,8 +1,4 @@
-"""Do claims hold? The first rule is in docs/protocol.md, the claims are in a file: `claims_config`.
-
-A part of a claim, a comparison of two variants, is shown, reversed, absent or open; of these comes
-the verdict on the claim. A file may ask for the second rule instead: `direction_and_size`.
-"""
+"""Do claims hold? By the first rule (docs/protocol.md) or the second (`direction_and_size`)."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -12,12 +8,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, FamilyConfig, Part, Table1Config
+from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, Part, Table1Config
 from mace_rl.study.compare import direction_and_size
 from mace_rl.study.compare.estimates import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING, find, pairs_of
 from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import holm
-from mace_rl.study.measure.metrics import all_metrics
+from mace_rl.study.measure.metrics import metric_units
 from mace_rl.study.metrics_config import MetricsConfig
 
 
@@ -25,26 +21,19 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -
     """An answer to each claim that the runs in `table` can answer.
 
     table: the frame of metrics.csv with the `CORRELATIONS` asked for; seeds may differ between
-    environments, not between variants. Of one seed there are no intervals and no tests: NaN.
+    environments, not between variants.
     """
     lacking = claims.lacking(table["env"], table["variant"], settings)
-    return [
-        answer
-        for title, family in claims.families.items()
-        if not lacking[title]
-        for answer in _answers(title, family, claims, table, settings)
-    ]
+    asked = [title for title in claims.families if not lacking[title]]
+    return [answer for title in asked for answer in _answers(title, claims, table, settings)]
 
 
 def _answers(
-    title: str,
-    family: FamilyConfig,
-    claims: ClaimsConfig,
-    table: pd.DataFrame,
-    settings: MetricsConfig,
+    title: str, claims: ClaimsConfig, table: pd.DataFrame, settings: MetricsConfig
 ) -> Iterator[Answer]:
     """The answers to the claims of one family."""
-    words, table1 = family.words.model_dump(), claims.table1
+    family, table1 = claims.families[title], claims.table1
+    words = family.words.model_dump()
     judged: dict[str, dict[str, Judgement]] = {name: {} for name in family.claims}
     for how in family.ways:
         parts = {
@@ -91,11 +80,9 @@ def verdict(outcomes: Sequence[str]) -> str:
 
 def outcome(finding: Finding) -> str:
     """Of one part, whose p values are corrected."""
-    if finding.seeds < FEWEST_SEEDS:
-        return "open"
-    if finding.p_equivalent_holm < LEVEL:
+    if finding.seeds >= FEWEST_SEEDS and finding.p_equivalent_holm < LEVEL:
         return "absent"
-    if finding.p_holm < LEVEL:
+    if finding.seeds >= FEWEST_SEEDS and finding.p_holm < LEVEL:
         return "shown" if finding.difference > 0 else "reversed"
     return "open"
 
@@ -125,8 +112,8 @@ def _in_paper(claim: ClaimConfig, table1: Table1Config, settings: MetricsConfig)
     values = table1.values_of(part.environments, part.metric)
     if not values:
         return ""
-    units = {one.name: one.unit for one in all_metrics(settings)}
-    best = (min if units[part.metric] == "episodes" else max)(values, key=values.__getitem__)
+    lower = metric_units(settings)[part.metric] == "episodes"
+    best = (min if lower else max)(values, key=values.__getitem__)
     metric = next(one for one in table1.metrics if part.metric.startswith(one))
     numbers = ", ".join(f"{table1.variants[name]} {value}" for name, value in values.items())
     return f"{metric}: {numbers}; the best is {table1.variants[best]}"

@@ -1,8 +1,7 @@
 """What is measured on one run: how well it ends, and how soon it gets there (docs/metrics.md).
 
-`METRICS` lists them; columns, tables and comparisons follow it. A metric is a pure function of a
-`LearningCurve`; `metrics.custom` in the configuration adds the user's own. A run that never attains
-a metric in episodes counts with E and is flagged as censored: E is then a lower bound.
+A metric is a pure function of a `LearningCurve`. A run that never attains a metric in episodes
+counts with E, its number of episodes, and is flagged as censored: E is then a lower bound.
 """
 
 import math
@@ -97,10 +96,7 @@ class Metric:
 
 
 def last_part(returns: np.ndarray, fraction: float) -> np.ndarray:
-    """The last `fraction` of the episodes (paper: the last 10 %).
-
-    Where that is no whole number of episodes it is rounded up: 15 episodes end with the last 2.
-    """
+    """The last `fraction` of the episodes, rounded up (paper: the last 10 %)."""
     last = math.ceil(Fraction(repr(fraction)) * len(returns))  # 0.07 of 100 is 7, not 7.000…001
     return returns[-last:]
 
@@ -111,10 +107,7 @@ def final_return(returns: np.ndarray, fraction: float) -> float:
 
 
 def moving_average(values: np.ndarray, window: int) -> np.ndarray:
-    """Mean of each `window` consecutive values, [E - window + 1]; empty if E < window.
-
-    Entry i is the average after episode `window` + i.
-    """
+    """Mean of each `window` consecutive values, [E - window + 1]; empty if E < window."""
     return _moving_sum(values, window) / window
 
 
@@ -122,19 +115,16 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
     """Slope of the moving average in return per episode, [E - 2 · window + 1] or empty.
 
     Entry i belongs to episode 2 · `window` + i and compares the last `window` episodes with the
-    `window` before them. (From one episode to the next, a moving average changes by the difference
-    of two single episodes: that slope is noise, and 0 wherever two returns happen to be equal.)
+    `window` before them. (From one episode to the next the average's change is noise.)
     """
     total = _moving_sum(returns, window)
     return (total[window:] - total[:-window]) / window**2
 
 
 def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
-    """`slope` from the first episodes on: while there are no 2 windows, of the halves there are.
+    """`slope` from episode 2 · ceil(window / 10) on: single episodes side by side are noise.
 
-    After episode t the last h episodes are compared with the h before them, h being t / 2, rounded
-    down, and `window` at most. The first h is a tenth of `window`: single episodes side by side are
-    noise. Entry i belongs to episode 2 · ceil(window / 10) + i.
+    While there are no 2 windows, the halves of the episodes so far are compared.
     """
     first = 2 * math.ceil(window / 10)
     ends = range(first, min(2 * window, len(returns) + 1))
@@ -145,17 +135,16 @@ def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
 def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
     """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
 
-    returns, betas: [E]. Stagnation is minus the slope of the moving average, from episode
-    2 · `window` on. A β that never moves does not rise when progress stalls: no correlation.
+    returns, betas: [E]. Stagnation is minus the `slope`.
     """
     return _correlation(-slope(returns, window), betas)
 
 
 def stagnation_correlations(curve: LearningCurve, betas: np.ndarray) -> tuple[float, float]:
-    """The same before and after the run reaches the common bar, by the `growing_slope`.
+    """The same, by the `growing_slope`, before and after `sample_efficiency_common`.
 
-    betas: [E]. An episode's stagnation and the next one's β are before the bar if both are, that is
-    up to `sample_efficiency_common`. 0, too, for a time of which there are fewer than two.
+    betas: [E]. An episode's stagnation and the next one's β are before that episode if both are.
+    0, too, for a time of which there are fewer than two.
     """
     reached = sample_efficiency_common(curve)
     stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
@@ -176,8 +165,7 @@ def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
 def sample_efficiency(curve: LearningCurve) -> Attained:
     """The first episode with a return ≥ threshold · final (paper, literally).
 
-    One lucky episode is enough. Where returns are negative the bar lies *above* the final return
-    (75 % of -85 is -63.75). Censored: never reached or, as the paper does not say, not `learned`.
+    Negative returns: the bar is above the final return. Censored: never reached, or not `learned`.
     """
     reached = curve.returns >= curve.settings.threshold * curve.final
     return curve.first(reached & curve.learned)
@@ -187,8 +175,8 @@ def convergence_steps(curve: LearningCurve) -> Attained:
     """The point where the slope of the moving average becomes minimal (paper).
 
     Our reading: the first episode, once the average has come threshold of the way from random to
-    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored: the
-    slope never falls that far, the run has not `learned`, or E < 2 windows.
+    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored:
+    never, or not `learned`.
     """
     settings, window = curve.settings, curve.settings.moving_average
     high = curve.average >= curve.bar(curve.final)
@@ -201,8 +189,7 @@ def convergence_steps(curve: LearningCurve) -> Attained:
 def convergence_steps_steepest(curve: LearningCurve) -> Attained:
     """The first episode after the steepest rise at which the slope is no longer positive.
 
-    The steepest rise can be the recovery from a late collapse. Censored: the average never rises,
-    is still rising at the end, the run has not `learned`, or E < 2 windows.
+    The steepest rise can be the recovery from a late collapse. Censored: never, or not `learned`.
     """
     window, slopes = curve.settings.moving_average, curve.slopes
     if not (slopes > 0).any():
@@ -214,8 +201,8 @@ def convergence_steps_steepest(curve: LearningCurve) -> Attained:
 def convergence_steps_flattest(curve: LearningCurve) -> Attained:
     """The first episode at which the absolute slope is smallest in all of training.
 
-    The most literal reading of the paper's sentence: it finds the flat start of a run that has yet
-    to learn, or chance on the final plateau. Censored: the run has not `learned`, or E < 2 windows.
+    The most literal reading: it finds the flat start of a run that has yet to learn, or chance on
+    the final plateau. Censored: E < 2 windows, or not `learned`.
     """
     magnitude = np.abs(curve.slopes)
     flattest = magnitude == magnitude.min(initial=np.inf)
@@ -225,9 +212,8 @@ def convergence_steps_flattest(curve: LearningCurve) -> Attained:
 def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     """The rule of the authors' public code, whatever the window configured here.
 
-    The first 50-episode window past 30 % of training after which the moving average changes by less
-    than 0.05 per episode over 50 episodes. As in that code, the number is the window's own (its
-    first episode): never less than 586 of 2000 and 1786 of 6000, whatever has been learned.
+    The first episode of the first 50-episode window past 30 % of training after which the moving
+    average changes by less than 0.05 per episode over 50 episodes: never less than 586 of 2000.
     """
     first = _public_code_first(PUBLIC_CODE_WINDOW, len(curve.returns))
     flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[first - 1 :]) < PUBLIC_CODE_SLOPE
@@ -237,8 +223,7 @@ def convergence_steps_public_code(curve: LearningCurve) -> Attained:
 def sample_efficiency_common(curve: LearningCurve) -> Attained:
     """The first episode whose moving average has come threshold of the way to the reference.
 
-    The bar is random + threshold · (reference - random), the same for every variant: ending worse
-    does not lower it. Censored: never reached.
+    The bar is the same for every variant: ending worse does not lower it. Censored: never reached.
     """
     reached = curve.average >= curve.bar(curve.reference)
     return curve.first(reached, curve.settings.moving_average)
@@ -247,18 +232,16 @@ def sample_efficiency_common(curve: LearningCurve) -> Attained:
 def sample_efficiency_range(curve: LearningCurve) -> Attained:
     """The first episode whose moving average has come threshold of the way from random to final.
 
-    The bar is random + threshold · (final - random): it means the same for negative returns, and
-    one lucky episode does not reach it. Censored: the run has not `learned`.
+    Censored: not `learned`.
     """
     reached = curve.average >= curve.bar(curve.final)
     return curve.first(reached & curve.learned, curve.settings.moving_average)
 
 
 def convergence_steps_range(curve: LearningCurve) -> Attained:
-    """The first episode from which on the moving average stays near the final return.
+    """The first episode from which on the moving average stays within band · (final - random).
 
-    Near is within band · (final - random). Censored: the average ends outside that band, or the
-    run has not `learned`.
+    Censored: the average ends farther from the final return, or not `learned`.
     """
     settings, gain = curve.settings, curve.final - curve.random_mean
     near = np.abs(curve.average - curve.final) <= settings.convergence_band * gain
@@ -322,9 +305,8 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
         elif {metric.name, metric.flag} & columns.keys():
             problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
         elif metric.unit not in COLUMN_TYPES:
-            problem = (
-                f"has the unit {metric.unit!r}, but should have one of {', '.join(COLUMN_TYPES)}"
-            )
+            units = ", ".join(COLUMN_TYPES)
+            problem = f"has the unit {metric.unit!r}, but should have one of {units}"
         else:
             metrics.append(metric)
             continue

@@ -11,26 +11,16 @@ import pandas as pd
 
 from mace_rl.config.section import ConfigError
 from mace_rl.records import RecordError, RunKey, read_table
-from mace_rl.study.measure.metrics import (
-    CORRELATION,
-    CORRELATIONS,
-    Attained,
-    LearningCurve,
-    Metric,
-    all_metrics,
-    final_return,
-    metrics_columns,
-    stagnation_correlation,
-    stagnation_correlations,
-)
+from mace_rl.study.measure import metrics as measured
+from mace_rl.study.measure.metrics import LearningCurve, Metric, all_metrics, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 
 
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:
     """The columns of betas.csv; without a common bar nothing is before or after it."""
-    measured = ["beta_end", "beta_lowest", "beta_highest"]
-    measured += CORRELATIONS if settings.reference_return else [CORRELATION]
-    return {"env": str, "variant": str, "seed": int} | dict.fromkeys(measured, float)
+    correlations = measured.CORRELATIONS if settings.reference_return else [measured.CORRELATION]
+    values = dict.fromkeys(["beta_end", "beta_lowest", "beta_highest", *correlations], float)
+    return {"env": str, "variant": str, "seed": int} | values
 
 
 def metrics_of_run(
@@ -39,13 +29,12 @@ def metrics_of_run(
     """The row of metrics.csv of one run, from its records (`read_episodes`)."""
     environment, variant, seed = run
     curve = _curve(frame, environment, settings)
-    row: dict[str, str | int | float]
-    row = {"env": environment, "variant": variant, "seed": seed, "episodes": len(curve.returns)}
-    row["env_steps"] = int(frame["env_steps"].iloc[-1])
+    row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
+    row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
     metrics = all_metrics(settings)
     for metric in metrics:
         value = metric.function(curve)
-        if metric.unit == "episodes" and isinstance(value, Attained):
+        if metric.unit == "episodes" and isinstance(value, measured.Attained):
             row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
         elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
             row[metric.name] = float(value)
@@ -57,34 +46,27 @@ def metrics_of_run(
 
 def _curve(frame: pd.DataFrame, environment: str, settings: MetricsConfig) -> LearningCurve:
     returns = frame["extrinsic_return"].to_numpy()
-    final = final_return(returns, settings.final_fraction)
+    final = measured.final_return(returns, settings.final_fraction)
     random = settings.random_return_in(environment)
     goals = [goal[environment] if goal else math.nan for goal in settings.goals]
     return LearningCurve(returns, final, random, settings, *goals)
 
 
 def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """One row of `metrics_columns` per run, in the order of `runs`.
-
-    Raises `ConfigError` and `RecordError` for metrics that cannot be.
-    """
+    """One row of `metrics_columns` per run, in the order of `runs`."""
     table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
     _check_attained("the table of metrics", table, all_metrics(settings))
     return table
 
 
 def betas_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """The data of betas.csv: of each run β at its end, its range, and how it goes with stagnation.
-
-    The end is that of `final_return`; the last columns are what `stagnation_correlation` says and,
-    where there is a common bar, `stagnation_correlations`.
-    """
+    """The data of betas.csv: of each run β at its end, its range, its stagnation correlations."""
     rows = []
     for run, frame in runs.items():
         beta, curve = frame["beta"].to_numpy(), _curve(frame, run[0], settings)
-        end = final_return(beta, settings.final_fraction)
-        found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
-        found += stagnation_correlations(curve, beta) if settings.reference_return else []
+        end = measured.final_return(beta, settings.final_fraction)
+        found = [measured.stagnation_correlation(curve.returns, beta, settings.moving_average)]
+        found += measured.stagnation_correlations(curve, beta) if settings.reference_return else []
         rows.append([*run, end, beta.min(), beta.max(), *found])
     return pd.DataFrame(rows, columns=list(betas_columns(settings)))
 

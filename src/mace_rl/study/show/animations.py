@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,19 +20,9 @@ class Animation:
     title: str
     extrinsic_return: float  # of the whole episode
     moving: str
-    still: str  # the last picture, for who prefers no motion
+    still: str  # the last picture, for readers who prefer no motion
     variants: tuple[str, ...]
     trained: bool
-
-
-def first_seeds(
-    runs: Iterable[tuple[str, str, int, int]], records: Iterable[str]
-) -> dict[tuple[str, str], Path]:
-    """The folder of the first seed of each environment and variant; `records`: its `run.json`."""
-    folders: dict[tuple[str, str], Path] = {}
-    for (environment, variant, *_), record in zip(runs, records, strict=True):
-        folders.setdefault((environment, variant), Path(record).parent)
-    return folders
 
 
 def animations(
@@ -43,10 +33,9 @@ def animations(
 ) -> tuple[dict[str, list[Animation]], list[str]]:
     """Films of one run of each environment and variant, and sentences on what there is not.
 
-    `runs` are folders, named in what is missing as seen from `origin`. Variants whose untrained
+    `runs` are folders, which the sentences name as seen from `origin`. Variants whose untrained
     agents do the same share that film. Runs may name code from outside this package if their
-    configuration is among the reader's `own`. An agent that is not there and an environment that
-    cannot be drawn are said; an agent that is not the one of its `run.json` is an error.
+    configuration is among the reader's `own`.
     """
     missing = []
     without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]

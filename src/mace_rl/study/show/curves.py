@@ -1,8 +1,4 @@
-"""The figures: what runs do over training, as data and as pictures.
-
-Figure 1 is the paper's, the extrinsic return; Figure 2 shows β. A picture is drawn from its data
-alone, and the same data gives the same file, byte for byte.
-"""
+"""The figures: what runs do over training, as data and as pictures; equal data, equal files."""
 
 import io
 import math
@@ -21,6 +17,7 @@ from matplotlib.figure import Figure
 
 from mace_rl.records import RecordError, RunKey
 from mace_rl.study.compare.statistics import interval
+from mace_rl.study.compare.summary import from_to
 from mace_rl.study.measure.metrics import metric_labels, moving_average
 from mace_rl.study.metrics_config import FigureConfig, MetricsConfig
 
@@ -80,27 +77,19 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
     """The curve of every run: the moving average of the `shown` column.
 
     `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
-    is over the last `window` episodes; over all there are so far in the first `window` - 1. Of
-    E > 500 episodes only every ⌈E / 500⌉-th is kept, counted back from the last: more could not
-    be seen.
+    is over the last `window` episodes, or over all there are so far. Of E > 500 episodes only every
+    ⌈E / 500⌉-th is kept, counted back from the last: more could not be seen.
     Columns: env, variant, seed, episode and the average by its name.
     """
     columns = ["env", "variant", "seed", "episode", shown.name]
-    variants = {
-        variant
-        for (_, variant, _), frame in frames.items()
-        if shown.zero_is_shown or frame[shown.column].any()
-    }
+    every = shown.zero_is_shown
+    variants = {run[1] for run, own in frames.items() if every or own[shown.column].any()}
     curves = []
     for (environment, variant, seed), frame in frames.items():
         values = frame[shown.column].to_numpy()
         head = values[: shown.window - 1]
-        average = np.concatenate(
-            [
-                np.cumsum(head) / np.arange(1, len(head) + 1),
-                moving_average(values, shown.window),
-            ]
-        )
+        growing = np.cumsum(head) / np.arange(1, len(head) + 1)
+        average = np.concatenate([growing, moving_average(values, shown.window)])
         stride = math.ceil(len(values) / MAX_POINTS)
         kept = np.arange(len(values) - 1, -1, -stride)[::-1]
         if variant in variants:
@@ -135,12 +124,7 @@ def mean_curves(
 def draw_figure(
     curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> Figure:
-    """A figure from `mean_curves` and `seed_curves`: one panel per environment.
-
-    The mean over seeds is a line, its interval a band (from three seeds on), and the single seeds
-    are faint lines behind. Where most is learned at the beginning, an inset shows that. Where there
-    is nothing to show, the figure says so.
-    """
+    """A figure from `mean_curves` and `seed_curves`: one panel per environment."""
     environments = list(curves["env"].unique())
     with style():
         names = ("Training episodes", shown.label) if environments else ("", "")
@@ -172,12 +156,11 @@ def draw_figure(
                 inset.set_xlim(0, share * own["episode"].max())
                 inset.locator_params(nbins=3)
                 inset.tick_params(labelsize="x-small")
-        fewest, most = curves["n"].min(), curves["n"].max()
-        explained = "One seed."
+        most, explained = curves["n"].max(), "One seed."
         if most > 1:
-            count = f"{most}" if fewest == most else f"{fewest} to {most}"
             band = f" Band: its {100 * look.confidence:g} % interval." if most >= BAND_SEEDS else ""
-            explained = f"Line: mean over {count} seeds.{band} Faint lines: single seeds."
+            line = f"Line: mean over {from_to(curves['n'])} seeds."
+            explained = f"{line}{band} Faint lines: single seeds."
         if look.layout.inset and any(axes.child_axes for axes in panels):
             explained += f" Inset: the first {100 * look.layout.inset:g} %."
         legend(figure, explained)
@@ -187,10 +170,7 @@ def draw_figure(
 def grid(
     count: int, columns: int, x: str = "", y: str = "", height: float = PANEL_HEIGHT
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels, at most so many side by side, so many inches high each.
-
-    `x` stands below those that have none below them, `y` once on the left.
-    """
+    """A figure of `count` panels of `height` inches; `x` stands below the lowest, `y` once."""
     columns = min(columns, count)
     rows = math.ceil(count / columns)
     figure = Figure(figsize=(WIDTH, rows * height + LEGEND_HEIGHT), layout="constrained")
@@ -209,22 +189,16 @@ def legend(figure: Figure, explained: str) -> None:
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, handle)
-    below = figure.legend(
-        list(entries.values()),
-        list(entries),
-        loc="outside lower center",
-        ncols=max(1, min(len(entries), 4, LETTERS // max(map(len, entries), default=1))),
-        title=explained,
-    )
-    for line in below.get_lines():
+    columns = max(1, min(len(entries), 4, LETTERS // max(map(len, entries), default=1)))
+    how: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "title": explained}
+    for line in figure.legend(list(entries.values()), list(entries), **how).get_lines():
         line.set_linewidth(2)
 
 
 def save_figure(figure: Figure, *paths: str | Path) -> None:
-    """Write a figure as PDF (fonts embedded as TrueType) or PNG, by the suffix of each path.
+    """Write a figure as PDF or PNG, by the suffix of each path, without date and version.
 
-    Without date and version, so that an equal figure gives an equal file. Each file's layout
-    starts from that of the one before: another order gives files that differ a little.
+    Each file's layout starts from that of the one before: the order of paths matters a little.
     """
     fields = {".pdf": ("CreationDate", "Creator", "Producer"), ".png": ("Software",)}
     with style():
@@ -234,10 +208,7 @@ def save_figure(figure: Figure, *paths: str | Path) -> None:
 
 
 def figure_as_svg(figure: Figure) -> str:
-    """A figure of this module as an SVG file without background, its text as text.
-
-    An equal figure gives an equal file here too.
-    """
+    """A figure as an SVG file without background, its text as text."""
     file = io.StringIO()
     fields = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with style():
@@ -267,9 +238,9 @@ def style() -> Iterator[None]:
 def _is_early(curves: pd.DataFrame, share: float) -> bool:
     """Whether every mean is most of its way up in the first `share` of the episodes."""
     early = curves[curves["episode"] <= share * curves["episode"].max()]
-    lowest = curves.groupby("variant")["mean"].min()
-    risen = early.groupby("variant")["mean"].max() - lowest
-    return bool((risen > MOSTLY * (curves.groupby("variant")["mean"].max() - lowest)).all())
+    means = curves.groupby("variant")["mean"]
+    risen = early.groupby("variant")["mean"].max() - means.min()
+    return bool((risen > MOSTLY * (means.max() - means.min())).all())
 
 
 def _draw(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
@@ -284,11 +255,6 @@ def _draw(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
             axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
         covered = sum(len(mean) == len(one) and abs(mean - one).max() <= near for one in drawn)
         drawn.append(mean)
-        axes.plot(
-            *(episodes, mean),
-            color=colour,
-            linestyle=(0, (4, 4 * covered)) if covered else "-",
-            linewidth=1.3,
-            label=look.labels[variant],
-            zorder=3,
-        )
+        line: dict[str, Any] = {"color": colour, "linewidth": 1.3, "zorder": 3}
+        line["linestyle"] = (0, (4, 4 * covered)) if covered else "-"
+        axes.plot(episodes, mean, label=look.labels[variant], **line)

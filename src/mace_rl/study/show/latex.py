@@ -31,16 +31,14 @@ def table1_latex(
     table: pd.DataFrame, labels: Mapping[str, str], settings: MetricsConfig, paper: Table1Config
 ) -> str:
     """Table 1 in the paper's layout from the data of table1.csv."""
-    what = escaped(paper.caption)
+    what = r". The best mean is \textbf{bold}. "
     if tables.counts_episodes(settings, paper):
         both = " for both" if len(paper.metrics) == 2 else ""
-        what += (
-            f", in training episodes. Lower is better{both}; the lowest mean is \\textbf{{bold}}. "
-        )
-    else:
-        what += r". The best mean is \textbf{bold}. "
+        best = r"the lowest mean is \textbf{bold}. "
+        what = f", in training episodes. Lower is better{both}; {best}"
+    caption = escaped(paper.caption) + what + _how(table, settings.confidence)
     frame = tables.table1(tables.named(table, labels), settings, paper)
-    return latex_float(what + _how(table, settings.confidence), "tab:table1", frame)
+    return latex_float(caption, "tab:table1", frame)
 
 
 def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
@@ -53,9 +51,8 @@ def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
     what = "PPO hyperparameters: those of the paper, and below the line those that it leaves open."
     columns = r"tabular}{@{}p{0.42\linewidth}l@{}"
     body = [*rows[:end], r"\midrule", *rows[end:]]
-    return _float(
-        "table", what, "tab:table2", *_lines(columns, r"Hyperparameter & Value \\", *body)
-    )
+    lines = _lines(columns, r"Hyperparameter & Value \\", *body)
+    return _float("table", what, "tab:table2", *lines)
 
 
 def _how(table: pd.DataFrame, confidence: float) -> str:
@@ -65,21 +62,15 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     for environment, group in table.groupby("env", sort=False):
         budget = " or ".join(str(episodes) for episodes in group["episodes"].unique())
         budgets.setdefault(budget, []).append(str(environment))
-    budget = "; ".join(
-        f"{episodes} episodes ({escaped(', '.join(environments))})"
-        for episodes, environments in budgets.items()
-    )
+    budget = "; ".join(f"{n} episodes ({escaped(', '.join(own))})" for n, own in budgets.items())
     level = escaped(f"{100 * confidence:g}")
     kinds = dict.fromkeys(INTERVALS[interval_kind(count)] for count in seeds if count > 1)
+    text = "One seed, which allows no interval."
     if kinds:
         kind = f" (below {BOOTSTRAP_SEEDS} seeds) or ".join(kinds)
         none = "; one seed allows none" if seeds[0] == 1 else ""
-        text = (
-            f"Means over {from_to(table['seeds'])} seeds and, below,"
-            f" their {level}\\,\\% {kind} intervals{none}."
-        )
-    else:
-        text = "One seed, which allows no interval."
+        text = f"Means over {from_to(table['seeds'])} seeds and, below, their {level}\\,\\% {kind}"
+        text += f" intervals{none}."
     text += f" Training budget: {budget}."
     if table["censored"].any():
         text += rf" $^{{\dagger k}}$: $k$ {tables.CENSORED}, a lower bound."
@@ -92,10 +83,7 @@ def escaped(text: str) -> str:
 
 
 def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
-    """A table for \\input, as wide as the page; it needs the package booktabs and nothing else.
-
-    The columns beyond `COLUMNS_PER_BLOCK` go into tabulars below.
-    """
+    """A table for \\input, as wide as the page; it needs the package booktabs and nothing else."""
     head, *names = frame.columns
     starts = range(0, len(names), COLUMNS_PER_BLOCK)
     blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]

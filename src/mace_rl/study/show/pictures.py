@@ -1,8 +1,6 @@
-"""Pictures of all runs at once, each drawn from data that stands beside it as CSV.
+"""Pictures of all runs at once, each drawn from data that stands beside it as CSV."""
 
-`PICTURES` has them by name: what makes the data, and what draws it.
-"""
-
+import itertools
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -74,23 +72,18 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 def constants(source: Source) -> pd.DataFrame:
-    """The mean return of training of every variant, from the frame of metrics.csv.
-
-    Columns: env, variant, role (`FIXED_BETA` in their order, `LEARNED` or `OTHER`), mean over the
-    seeds, low, high (its interval), seeds.
-    """
+    """The mean return of training of every variant, with its role, from metrics.csv's frame."""
     runs, settings = source.data["metrics"], source.settings
-    assert settings.constants is not None  # or nobody asks
+    assert settings.constants is not None  # `fits` has asked
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
     roles[settings.constants.learned] = LEARNED
     areas = {key: own["area_under_curve"] for key, own in runs.groupby(["env", "variant"])}
     rows = []
-    for environment in runs["env"].unique():
-        for variant, role in roles.items():
-            values = areas[environment, variant].to_numpy()
-            low, high = interval(values, settings)
-            rows.append((environment, variant, role, values.mean(), low, high, len(values)))
+    for environment, variant in itertools.product(runs["env"].unique(), roles):
+        values = areas[environment, variant].to_numpy()
+        found = values.mean(), *interval(values, settings), len(values)
+        rows.append((environment, variant, roles[variant], *found))
     return pd.DataFrame(rows, columns=["env", "variant", "role", "mean", "low", "high", "seeds"])
 
 
@@ -103,16 +96,13 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
             fixed = own[own["role"] == FIXED_BETA]
             for place, (_, row) in enumerate(own[own["role"] != LEARNED].iterrows()):
                 constant, name = row["role"] == FIXED_BETA, row["variant"]
-                axes.errorbar(
-                    place + 0.5 * (not constant),
-                    row["mean"],
-                    # Of equal values a bound and the mean may differ in the last bit.
-                    np.maximum(0, [[row["mean"] - row["low"]], [row["high"] - row["mean"]]]),
-                    fmt="o",
-                    markersize=3,
-                    color="dimgray" if constant else look.colours[name],
-                    label=None if constant else look.labels[name],
-                )
+                dot: dict[str, Any] = {"color": "dimgray"}
+                if not constant:
+                    dot = {"color": look.colours[name], "label": look.labels[name]}
+                # Of equal values a bound and the mean may differ in the last bit.
+                ends = np.maximum(0, [[row["mean"] - row["low"]], [row["high"] - row["mean"]]])
+                at = place + 0.5 * (not constant), row["mean"]
+                axes.errorbar(*at, ends, fmt="o", markersize=3, **dot)
             axes.plot(range(len(fixed)), fixed["mean"], color="dimgray", linewidth=0.8)
             for _, row in own[own["role"] == LEARNED].iterrows():
                 colour, label = look.colours[row["variant"]], look.labels[row["variant"]]
@@ -128,10 +118,7 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 def solved(source: Source) -> pd.DataFrame:
-    """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame.
-
-    Columns: env, variant, solved, seeds.
-    """
+    """How many seeds solve at least `SOLVED` of their last episodes, from metrics.csv's frame."""
     runs = source.data["metrics"]
     counted = runs.assign(solved=runs["solved"] >= SOLVED).groupby(["env", "variant"], sort=False)
     return counted["solved"].agg(solved="sum", seeds="size").reset_index()
@@ -143,12 +130,8 @@ def draw_solved(table: pd.DataFrame, look: PlotStyle) -> Figure:
         share=table["solved"] / table["seeds"],
         text=table["solved"].astype(str) + "/" + table["seeds"].astype(str),
     )
-    share, text = (
-        table.pivot(index="variant", columns="env", values=name).loc[
-            table["variant"].unique(), table["env"].unique()
-        ]
-        for name in ("share", "text")
-    )
+    wide = table.pivot(index="variant", columns="env").loc[table["variant"].unique()]
+    share, text = (wide[name][table["env"].unique()] for name in ("share", "text"))
     with style():
         figure, (axes,) = grid(1, 1, height=0.24 * len(share) + 2 * LEGEND_HEIGHT)
         blues = seaborn.light_palette("#4a90c8", as_cmap=True)  # on which one colour can be read
@@ -173,16 +156,16 @@ def forest(source: Source) -> pd.DataFrame:
     (of the part), by the second rule its size. More is in the claim's favour.
     """
     rows = []
-    for how in dict.fromkeys(how for answer in source.answers for how in answer.ways):
-        for answer in (answer for answer in source.answers if how in answer.ways):
-            judged = answer.ways[how]
-            common = (how, answer.claim, answer.statement, judged.verdict, judged.outcome)
-            for part in judged.parts:
-                values = part.difference, part.low, part.high, part.in_paper
-                scaled = [value / part.worth_mentioning for value in values]
-                measured = (_what(part, judged.parts, source), part.metric, part.seeds)
-                size = [part.size] if isinstance(part, SizedFinding) else []
-                rows.append((*common, *measured, *scaled, part.outcome, *size))
+    for answer, (how, judged) in ((one, way) for one in source.answers for way in one.ways.items()):
+        common = (how, answer.claim, answer.statement, judged.verdict, judged.outcome)
+        for part in judged.parts:
+            values = part.difference, part.low, part.high, part.in_paper
+            scaled = [value / part.worth_mentioning for value in values]
+            measured = (_what(part, judged.parts, source), part.metric, part.seeds)
+            size = [part.size] if isinstance(part, SizedFinding) else []
+            rows.append((*common, *measured, *scaled, part.outcome, *size))
+    ways = list(dict.fromkeys(how for how, *_ in rows))
+    rows.sort(key=lambda row: ways.index(row[0]))
     columns = ["measured", "claim", "statement", "verdict", "answer", "part", "metric", "seeds"]
     columns += ["difference", "low", "high", "paper", "outcome", "size"]
     return pd.DataFrame(rows, columns=columns[: len(rows[0])])
@@ -261,10 +244,7 @@ def _wrapped(words: str, width: int) -> str:
 def _placed(
     table: pd.DataFrame, lines: Mapping[str, int]
 ) -> tuple[pd.DataFrame, dict[str, tuple[float, float]]]:
-    """The parts with their `place` from the top, and from where to where each claim reaches.
-
-    lines: of text that stand beside a claim, and may need more room than its parts.
-    """
+    """The parts with their `place` from the top, and each claim's ends; lines: of its text."""
     end, blocks, placed = 0.0, {}, []
     for name, claim in table.groupby("claim", sort=False):
         order = claim.groupby("measured").cumcount()
@@ -281,7 +261,7 @@ def readings(source: Source) -> pd.DataFrame:
 
 
 def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
-    """Every reading as a line of dots with intervals, from `readings`; the paper's are hollow."""
+    """Every reading as a line of dots with intervals; the paper's are hollow."""
     environments, lines = list(table["env"].unique()), in_order(table)
     variants = list(table["variant"].unique())
     step = min(0.22, 0.8 / len(variants))  # of a line, from variant to variant

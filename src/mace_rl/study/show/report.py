@@ -1,7 +1,6 @@
 """The report: what the template `report.html` shows, from a study's outputs.
 
-One file that needs nothing else: pictures and styles stand in it, there is no script, and its
-content security policy has the browser refuse whatever would be loaded.
+One file that needs nothing else: pictures and styles stand in it, and there is no script.
 """
 
 import html
@@ -30,9 +29,7 @@ from mace_rl.study.show import sections, tables
 from mace_rl.study.show.animations import Animation
 from mace_rl.study.show.curves import PlotStyle, quantity, style
 from mace_rl.study.show.pictures import PICTURES, Source
-from mace_rl.study.show.sections import Data, Section
 from mace_rl.study.show.svg import PAGE_COLOURS, panels, svg
-from mace_rl.study.show.tables import Cell, number
 
 TEMPLATE = Path(__file__).with_name("report.html")
 FIGURES = ("1", "2")
@@ -40,7 +37,7 @@ FIGURES = ("1", "2")
 
 @dataclass(frozen=True)
 class Provenance:
-    """How it was made."""
+    """How the study's results were made."""
 
     command: str
     configuration: Mapping[str, str]  # text by file, in the order in which they are read
@@ -49,7 +46,7 @@ class Provenance:
 
 
 def page(
-    data: Data,
+    data: sections.Data,
     answers: Sequence[Answer],
     claims: ClaimsConfig,
     provenance: Provenance,
@@ -68,9 +65,7 @@ def page(
     environment.filters |= {"three_digits": three_digits, "table": as_html, "note": _note}
     metrics, records = data["metrics"], provenance.records
 
-    def of(figure: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-        return data[f"figure{figure}"], data[f"figure{figure}_seeds"]
-
+    figures = {name: (data[f"figure{name}"], data[f"figure{name}_seeds"]) for name in FIGURES}
     names = dict(look.labels) | metric_labels(settings)
     return environment.get_template(TEMPLATE.name).render(
         claims=claims,
@@ -88,8 +83,8 @@ def page(
         labels=look.labels,
         colours={variant: style()(to_hex)(colour) for variant, colour in look.colours.items()},
         page_colours=PAGE_COLOURS,
-        figures={name: panels(*of(name), quantity(name, settings), look) for name in FIGURES},
-        curved={figure: set(data[f"figure{figure}"]["variant"]) for figure in FIGURES},
+        figures={k: panels(*own, quantity(k, settings), look) for k, own in figures.items()},
+        curved={name: set(curves["variant"]) for name, (curves, _) in figures.items()},
         shown=animations[0],
         missing=animations[1],
         pictures=_pictures(Source(data, answers, settings, claims), look),
@@ -102,7 +97,7 @@ def page(
 def three_digits(value: float) -> str:
     """A return with three significant digits, or all that stand before the point."""
     digits = 2 - math.floor(math.log10(abs(value))) if value else 0
-    return number(value, max(digits, 0))
+    return tables.number(value, max(digits, 0))
 
 
 def as_html(frame: pd.DataFrame) -> Markup:
@@ -121,7 +116,7 @@ def as_html(frame: pd.DataFrame) -> Markup:
     return Markup('<div class="scroll"><table class="data">' + "\n".join(lines) + "</table></div>")
 
 
-def _html(cell: str | Cell) -> str:
+def _html(cell: str | tables.Cell) -> str:
     if isinstance(cell, str):
         return html.escape(cell)
     texts = [
@@ -150,13 +145,13 @@ def _pictures(source: Source, look: PlotStyle) -> dict[str, str]:
 
 
 def _sections(
-    data: Data,
+    data: sections.Data,
     claims: ClaimsConfig,
     provenance: Provenance,
     settings: MetricsConfig,
     names: Mapping[str, str],
-) -> dict[str, Section]:
-    """Every table but the ledger's, by its title, and three that the pages of Markdown have not."""
+) -> dict[str, sections.Section]:
+    """Every table but the ledger's, by its title, and three that the pages of Markdown lack."""
     compared = tables.named(data["comparisons"], names)
     means = pd.concat([data["table1"], data["supplement"]])
     note = (
@@ -166,19 +161,15 @@ def _sections(
     costs = tables.costs(provenance.records, data["metrics"], names)
     interruptions = sum(len(record["interruptions"]) for record in provenance.records)
     machine = "As each run's run.json has it; one core a run, no GPU."
-    others = {
-        "Variants against each other, on every metric": (
-            note,
-            tables.comparisons(compared, means, settings),
-        ),
-        "Costs": (f"{machine} Interruptions: {interruptions}.", costs),
-        "PPO's settings, as resolved": (
-            "Table 2; for LaTeX table2.tex.",
-            tables.table2(provenance.ppo, claims.table2),
-        ),
-    }
-    found = {section.title: section for section in sections.of_runs(data, claims, settings, names)}
-    return found | {title: Section(title, *own) for title, own in others.items()}
+    compared = tables.comparisons(compared, means, settings)
+    ppo = tables.table2(provenance.ppo, claims.table2)
+    found = sections.of_runs(data, claims, settings, names)
+    found += [
+        sections.Section("Variants against each other, on every metric", note, compared),
+        sections.Section("Costs", f"{machine} Interruptions: {interruptions}.", costs),
+        sections.Section("PPO's settings, as resolved", "Table 2; for LaTeX table2.tex.", ppo),
+    ]
+    return {section.title: section for section in found}
 
 
 def _origins(records: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[str, int]]]:

@@ -1,7 +1,4 @@
-"""The sections of a study, each a title, a note and a table: what its pages are made of.
-
-claims.md and tables.md have them as they are; the report has the same under its pictures.
-"""
+"""The sections of a study, each a title, a note and a table: what its pages are made of."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -89,18 +86,13 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
 def of_runs(
     data: Data, claims: ClaimsConfig, settings: MetricsConfig, names: Mapping[str, str]
 ) -> list[Section]:
-    """Everything but the ledger, with these names of the variants.
-
-    data: frames by the name of their CSV file: metrics, betas, table1, supplement, comparisons,
-    aggregate and, where the study has them, readings.
-    """
+    """Everything but the ledger, with these names of the variants."""
     data = {name: tables.named(frame, names) for name, frame in data.items()}
-    return [
-        *_means(data, claims, settings),
-        *_compared(data, settings),
-        *_others(data, settings),
-        *_companions(data, settings),
-    ]
+    found = [*_means(data, claims, settings), *_compared(data, settings), *_others(data, settings)]
+    note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
+    for environment, frame in tables.companions(data["supplement"], settings).items():
+        found.append(Section(f"The other metrics: {environment}", note, frame))
+    return found
 
 
 def _means(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> Iterator[Section]:
@@ -161,10 +153,3 @@ def _others(data: Data, settings: MetricsConfig) -> Iterator[Section]:
             " before (C9)."
         )
         yield Section("β", note, frame)
-
-
-def _companions(data: Data, settings: MetricsConfig) -> Iterator[Section]:
-    """Every metric but Table 1's, environment by environment."""
-    note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
-    for environment, frame in tables.companions(data["supplement"], settings).items():
-        yield Section(f"The other metrics: {environment}", note, frame)

@@ -19,10 +19,7 @@ MAX_POINTS = 250  # per curve: a point for every pixel and a half
 def panels(
     curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> dict[str, str]:
-    """The panel of each environment, as `draw_figure` draws it from the same data.
-
-    The legend is left out. Fewer points are drawn than in the figure's files, the last one always.
-    """
+    """The panel of each environment, as `draw_figure` draws it of fewer points; no legend."""
     drawn: dict[str, str] = {}
     for environment, own in curves.groupby("env", sort=False):
         seeds = single_seeds[single_seeds["env"] == environment]

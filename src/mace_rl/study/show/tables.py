@@ -1,12 +1,7 @@
-"""Every table of a study, as a frame of cells.
-
-A frame of cells has a table's heads as columns; its values are words (`str`) and `Cell`s of numbers
-with intervals. `markdown`, `report` and `latex` print it. Variants have the names that the data
-have: `named` gives them others first.
-"""
+"""Every table of a study, as a frame of words (`str`) and `Cell`s of numbers with intervals."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +35,7 @@ class Value(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Several values in one cell, and what is to be said beside them. (One word is a `str`.)"""
+    """Several values in one cell, and a note beside them. (Words alone are a `str`.)"""
 
     values: Sequence[Value]
     joint: str = " / "
@@ -54,17 +49,10 @@ def number(value: float | None, digits: int = 0) -> str:
     return f"{value:z.{digits}f}".replace("-", "−")
 
 
-def estimate(
-    value: float | None,
-    low: float | None,
-    high: float | None,
-    digits: int = 0,
-    mark: str = "",
-    best: bool = False,
-) -> Value:
-    """A number with its interval, of dashes where there is none."""
-    text, start, end = (number(one, digits) for one in (value, low, high))
-    return Value(text, start, end, mark, best)
+def estimate(value: Iterable[Any], digits: int, mark: str = "", best: bool = False) -> Value:
+    """A number, low and high of its interval, as printed; dashes where there is none."""
+    text, low, high = (number(one, digits) for one in value)
+    return Value(text, low, high, mark, best)
 
 
 def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
@@ -77,16 +65,14 @@ def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) ->
     """Table 1 in the paper's layout, of the data of table1.csv: its metrics side by side.
 
     Rows are variants, columns environments. The best mean of each environment and metric is bold,
-    as displayed; ties all are, and a mean of seeds that all never got there is not. The paper's
-    numbers stand beside.
+    as displayed: ties all are; a mean of seeds that all never got there is not.
     """
-    digits = digits_by_metric(table, settings)
-    best = {}
+    digits, units = digits_by_metric(table, settings), metric_units(settings)
+    best: dict[Any, str] = {}
     attained = table[table["censored"] < table["seeds"]]
     for (env, metric), means in attained.groupby(["env", "metric"])["mean"]:
-        key = str(env), str(metric)
-        first = means.min() if metric_units(settings)[key[1]] == "episodes" else means.max()
-        best[key] = number(first, digits[key])
+        first = means.min() if units[str(metric)] == "episodes" else means.max()
+        best[env, metric] = number(first, digits[str(env), str(metric)])
 
     def cell(runs: pd.DataFrame) -> Cell:
         values, published = [], []
@@ -111,17 +97,13 @@ def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.Dat
     """By environment, a row for each metric of a `summary` and a column for each variant."""
     digits = digits_by_metric(table, settings)
     labelled = table.assign(label=table["metric"].map(metric_labels(settings)))
-    return {
-        str(environment): _grid(
-            own,
-            lambda rows: Cell(
-                [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
-            ),
-            rows="label",
-            columns="variant",
-        )
-        for environment, own in labelled.groupby("env", sort=False)
-    }
+
+    def cell(rows: pd.DataFrame) -> Cell:
+        values = [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
+        return Cell(values)
+
+    groups = labelled.groupby("env", sort=False)
+    return {str(env): _grid(own, cell, rows="label", columns="variant") for env, own in groups}
 
 
 def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
@@ -132,11 +114,9 @@ def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataF
 
 def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The final return of each variant's worst seed, from the frame of metrics.csv."""
-    returns = runs.assign(metric="final_return", mean=runs["final_return"])
-    digits = digits_by_metric(returns, settings)
-    return _grid(
-        returns, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0], "final_return"])
-    )
+    table = runs.assign(metric="final_return", mean=runs["final_return"])
+    digits = {env: count for (env, _), count in digits_by_metric(table, settings).items()}
+    return _grid(table, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0]]))
 
 
 def solved(runs: pd.DataFrame) -> pd.DataFrame:
@@ -147,22 +127,16 @@ def solved(runs: pd.DataFrame) -> pd.DataFrame:
 def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
     digits, labels = digits_by_metric(means, settings), metric_labels(settings)
-    return _rows(
-        table,
-        {
-            "environment": lambda row: row["env"],
-            "metric": lambda row: labels[row["metric"]],
-            "": lambda row: f"{row['variant']} over {row['baseline']}",
-            "n": lambda row: _number(row["seeds"]),
-            # All environments together have no digits, and no values that would need them.
-            "difference": lambda row: _estimate(
-                row, "difference", digits.get((row["env"], row["metric"]), 0), ends=""
-            ),
-            "p": lambda row: _number(row["p_value"], 4),
-            "p (Holm)": lambda row: _number(row["p_holm"], 4),
-            "P": lambda row: _estimate(row, "probability", 2),
-        },
-    )
+    rows = []
+    for _, row in table.iterrows():
+        # All environments together have no digits, and no values that would need them.
+        shown = digits.get((row["env"], row["metric"]), 0)
+        own = [row["env"], labels[row["metric"]], f"{row['variant']} over {row['baseline']}"]
+        own += [_number(row["seeds"]), _estimate(row, "difference", shown, ends="")]
+        own += [_number(row["p_value"], 4), _number(row["p_holm"], 4)]
+        rows.append([*own, _estimate(row, "probability", 2)])
+    heads = ["environment", "metric", "", "n", "difference", "p", "p (Holm)", "P"]
+    return pd.DataFrame(rows, columns=heads)
 
 
 def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
@@ -174,24 +148,17 @@ def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
 
 def aggregate(table: pd.DataFrame) -> pd.DataFrame:
     """aggregate.csv."""
-    return _rows(
-        table,
-        {
-            "": lambda row: row["variant"],
-            "score of": lambda row: row["metric"].replace("_", " "),
-            "runs": lambda row: _number(row["runs"]),
-            "mean": lambda row: _estimate(row, "mean", 3),
-            "interquartile mean": lambda row: _estimate(row, "iqm", 3),
-        },
-    )
+    rows = []
+    for _, row in table.iterrows():
+        own = [row["variant"], row["metric"].replace("_", " "), _number(row["runs"])]
+        rows.append([*own, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
+    return pd.DataFrame(rows, columns=["", "score of", "runs", "mean", "interquartile mean"])
 
 
 def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """Of each reading (`readings.csv`) and environment the variants, the first one first.
 
-    The best is a first place that the log-rank test against each of the others does not put down to
-    chance (p < 0.05, not corrected for the many readings); † means that some of the runs never got
-    there.
+    The best is a first place that is more than chance (`ranked`).
     """
 
     def cell(rows: pd.DataFrame) -> Cell:
@@ -214,12 +181,11 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
             continue
         found = runs["stagnation_correlation"].to_numpy()
-        low, high = interval(found, settings)
+        correlation = Cell([estimate((found.mean(), *map(float, interval(found, settings))), 3)])
         seeds = (
             ", ".join(number(beta, 2) for beta in runs[name].quantile([0, 0.5, 1]))
             for name in ("beta_end", "beta_lowest")
         )
-        correlation = Cell([estimate(found.mean(), float(low), float(high), 3)])
         rows.append([environment, variant, _number(len(runs)), *seeds, correlation])
     heads = ["environment", "", "n", "β at the end", "lowest β", "with stagnation"]
     return pd.DataFrame(rows, columns=heads)
@@ -244,21 +210,15 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
         of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
         digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
         pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
-        rows.append(
-            [
-                answer.claim,
-                "all" if len(part.environments) > 1 else part.environments[0],
-                names.get(part.metric, part.metric),
-                " over ".join(pair),
-                _number(part.seeds),
-                _estimate(vars(part), "difference", digits, ends=""),
-                *(_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)),
-                _estimate(vars(part), "probability", 2),
-                *(_number(part.in_paper, digits), _number(part.worth_mentioning, digits)),
-                _number(part.detectable, digits),
-                *(_by_size(part, digits) if isinstance(part, SizedFinding) else [part.outcome]),
-            ]
-        )
+        environment = "all" if len(part.environments) > 1 else part.environments[0]
+        sizes = part.in_paper, part.worth_mentioning, part.detectable
+        row: list[str | Cell] = [answer.claim, environment, names.get(part.metric, part.metric)]
+        row += [" over ".join(pair), _number(part.seeds)]
+        row += [_estimate(vars(part), "difference", digits, ends="")]
+        row += [_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)]
+        row += [_estimate(vars(part), "probability", 2), *(_number(one, digits) for one in sizes)]
+        row += _by_size(part, digits) if isinstance(part, SizedFinding) else [part.outcome]
+        rows.append(row)
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
     return pd.DataFrame(rows, columns=[*heads[: len(rows[0]) - 1], ""])
@@ -280,27 +240,17 @@ def costs(
     frame = frame[["environment", "variant", "seed", "seconds", "peak_memory_mb"]]
     frame = frame.rename(columns={"environment": "env"})
     frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
-    rows = [
-        [
-            env,
-            labels[str(variant)],
-            number(len(own)),
-            number(own["env_steps"].sum() / 1000),
-            *(duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")),
-            number(own["peak_memory_mb"].max()),
-        ]
-        for (env, variant), own in frame.groupby(["env", "variant"], sort=False)
-    ]
+    rows = []
+    for (env, variant), own in frame.groupby(["env", "variant"], sort=False):
+        row = [env, labels[str(variant)], number(len(own)), number(own["env_steps"].sum() / 1000)]
+        row += [duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")]
+        rows.append([*row, number(own["peak_memory_mb"].max())])
     heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
     return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
 
 
 def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
-    """The PPO hyperparameters, from the resolved settings of each environment.
-
-    The rows of the paper and Adam; then this project's further settings, those without a label
-    named after their key. A value that is not the same in all environments is shown for each.
-    """
+    """The PPO hyperparameters: the paper's rows and Adam, then this project's further settings."""
     own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
     rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
     rows += [["Optimizer", "Adam"]]
@@ -326,24 +276,16 @@ def _grid(
     return pd.DataFrame(lines, columns=[head, *across])
 
 
-def _rows(
-    table: pd.DataFrame, columns: Mapping[str, Callable[[pd.Series], str | Cell]]
-) -> pd.DataFrame:
-    """A row for each of the table's, what is printed in each column by its head."""
-    lines = [[cell(row) for cell in columns.values()] for _, row in table.iterrows()]
-    return pd.DataFrame(lines, columns=list(columns))
-
-
 def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:
     """A row of a `summary`, with the number of seeds that never got there."""
     mark = f"†{row['censored']}" if row["censored"] else ""
-    return estimate(row["mean"], row["low"], row["high"], digits, mark, best)
+    return estimate(row[["mean", "low", "high"]], digits, mark, best)
 
 
 def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell:
     """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
     prefix = f"{name}_" if ends is None else ends
-    return Cell([estimate(row[name], row[f"{prefix}low"], row[f"{prefix}high"], digits)])
+    return Cell([estimate((row[name], row[f"{prefix}low"], row[f"{prefix}high"]), digits)])
 
 
 def _number(value: float | None, digits: int = 0) -> Cell:
@@ -354,7 +296,9 @@ def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
     """The value of one setting, for each group of environments that share it."""
     environments: dict[str, list[str]] = {}
     for environment, config in ppo.items():
-        environments.setdefault(_value(getattr(config, name)), []).append(environment)
+        value = getattr(config, name)
+        text = "none" if value is None and name == "max_gradient_norm" else _value(value)
+        environments.setdefault(text, []).append(environment)
     if len(environments) == 1:
         return next(iter(environments))
     values = [Value(f"{value} ({', '.join(whose)})") for value, whose in environments.items()]
