@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from mace_rl.agent.learner import Update
-from mace_rl.experience import Experience
+from mace_rl.experience import Experience, joined
 from mace_rl.numerics.arrays import mean, variance
+from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.numerics.products import dot
 from mace_rl.records import UpdateRecord
@@ -35,22 +36,16 @@ def diagnose(
     """
 
     def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(item, name) for item in rollout])
+        return joined(getattr(item, name) for item in rollout)
 
-    def explained_variance(kind: str) -> float:
-        spread = variance(stacked(f"{kind}_returns"))
-        # A return minus the critic's value is the advantage.
-        left = variance(stacked(f"{kind}_advantages"))
-        return 1 - left / spread if spread > 0 else math.nan
+    def explained(kind: str) -> float:
+        return explained_variance(stacked(f"{kind}_advantages"), stacked(f"{kind}_returns"))
 
     def mean_of(part: str) -> float:
         if getattr(rollout[0].bonus, part, None) is None:  # plain PPO, or another bonus
             return math.nan
-        return mean(np.concatenate([getattr(item.bonus, part) for item in rollout]))
+        return mean(joined(getattr(item.bonus, part) for item in rollout))
 
-    has_bonus = rollout[0].bonus is not None
-    own, added = stacked("extrinsic_part"), stacked("intrinsic_share")
-    extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,
@@ -59,15 +54,29 @@ def diagnose(
         approximate_kl=update.approximate_kl,
         clip_fraction=update.clip_fraction,
         entropy=update.entropy,
-        explained_variance_extrinsic=explained_variance("extrinsic"),
-        explained_variance_intrinsic=explained_variance("intrinsic") if has_bonus else math.nan,
+        explained_variance_extrinsic=explained("extrinsic"),
+        explained_variance_intrinsic=explained("intrinsic"),
         gradient_norm_actor=update.gradient_norms["actor"],
         gradient_norm_extrinsic=update.gradient_norms["extrinsic"],
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),
         beta=sum(item.beta for item in rollout) / len(rollout),
-        bonus_share=weighted / (extrinsic + weighted) if extrinsic + weighted > 0 else math.nan,
+        bonus_share=share(stacked("intrinsic_share"), stacked("extrinsic_part")),
         novelty=mean_of("novelty"),
         relevance=mean_of("relevance"),
         similarity=mean_of("similarity"),
         beta_credit=math.nan if credit is None else credit,
     )
+
+
+@kernel
+def explained_variance(advantages, returns):
+    """1 - Var(return - V) / Var(return), where a return minus V is the advantage; else NaN."""
+    spread = variance(returns)
+    return 1 - variance(advantages) / spread if spread > 0 else math.nan
+
+
+@kernel
+def share(part, rest):
+    """Σ part² / (Σ part² + Σ rest²); NaN if there is nothing."""
+    own, both = dot(part, part), dot(rest, rest) + dot(part, part)
+    return own / both if both > 0 else math.nan

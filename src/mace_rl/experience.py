@@ -1,6 +1,7 @@
 """The rollout of an update: episodes with their bonus, advantages and returns."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,6 +42,11 @@ class Experience:
         """β A_I."""
         return self.beta * self.intrinsic_part
 
+    @cached_property
+    def total_advantages(self) -> np.ndarray:
+        """A_E + β A_I."""
+        return self.extrinsic_part + self.intrinsic_share
+
     def with_normalised_returns(self) -> "Experience":
         """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
         old = {k: getattr(self, f"{k}_returns") for k in ("extrinsic", "intrinsic")}
@@ -54,17 +60,13 @@ class Experience:
         return replace(self, **new)
 
 
+def joined(pieces: Iterable[np.ndarray]) -> np.ndarray:
+    """What the episodes of a rollout have, one after the other, [N, …]; of one episode its own."""
+    found = list(pieces)
+    return found[0] if len(found) == 1 else np.concatenate(found)
+
+
 def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
     """Observations, [N, observation], and actions of the episodes, one after the other."""
-    observations = np.concatenate([item.observations[:-1] for item in rollout])
-    return observations, np.concatenate([item.episode.actions for item in rollout])
-
-
-def joined(pieces: list[np.ndarray]) -> np.ndarray:
-    """The episodes' arrays one after the other, float32 [N]."""
-    return np.concatenate(pieces).astype(np.float32)
-
-
-def total_advantages(rollout: list[Experience]) -> np.ndarray:
-    """A_E + β A_I of every step, float64 [N]."""
-    return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
+    observations = joined(item.observations[:-1] for item in rollout)
+    return observations, joined(item.episode.actions for item in rollout)

@@ -33,7 +33,7 @@ from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 from mace_rl.environments.spaces import Spaces
-from mace_rl.experience import Experience, joined
+from mace_rl.experience import Experience
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
@@ -318,7 +318,9 @@ class PublishedTrainer(Trainer):
         """PPO on the total reward of one episode."""
         [item] = rollout
         with drawing_from(self.ppo.draws):
-            update, values = self.ppo.update(item.episode, joined([item.extrinsic_returns]))
+            update, values = self.ppo.update(
+                item.episode, item.extrinsic_returns.astype(np.float32)
+            )
         for name, network in (("actor", self.ppo.policy), *self.ppo.critics.items()):
             require_finite(f"a weight of the {name}", network.parameters)
         rollout[0] = replace(item, extrinsic_advantages=item.extrinsic_returns - values)

@@ -23,7 +23,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import Experience, joined, steps, total_advantages
+from mace_rl.experience import Experience, joined, steps
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
@@ -169,28 +169,27 @@ class Trainer:
         if not self.controller.learns:
             return None
         centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
-        extrinsic = np.concatenate([item.extrinsic_part for item in rollout])
-        intrinsic = np.concatenate([item.intrinsic_part for item in rollout])
+        extrinsic = joined(item.extrinsic_part for item in rollout)
+        intrinsic = joined(item.intrinsic_part for item in rollout)
+        total_advantages = joined(item.total_advantages for item in rollout)
         if centred:
-            extrinsic -= mean(extrinsic)
-        change = normalised_change(total_advantages(rollout), intrinsic, centred)
+            extrinsic = extrinsic - mean(extrinsic)
+        change = normalised_change(total_advantages, intrinsic, centred)
         gradient, change = learner.policy_gradients(*steps(rollout), [extrinsic, change])
         effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
+        returns = {"extrinsic": joined(item.extrinsic_returns for item in rollout)}
         if self.curiosity is not None:
-            returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
-        advantages = normalised(total_advantages(rollout), self.config.ppo.centre_advantages)
+            returns["intrinsic"] = joined(item.intrinsic_returns for item in rollout)
+        total_advantages = joined(item.total_advantages for item in rollout)
+        advantages = normalised(total_advantages, self.config.ppo.centre_advantages)
+        log_probs = joined(item.episode.log_probs for item in rollout)
+        batch = Batch(*steps(rollout), log_probs, advantages.astype(np.float32))
         update = self.ppo.update(
-            Batch(
-                *steps(rollout),
-                log_probs=joined([item.episode.log_probs for item in rollout]),
-                advantages=advantages.astype(np.float32),
-            ),
-            returns,
+            batch, {kind: values.astype(np.float32) for kind, values in returns.items()}
         )
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
@@ -215,7 +214,7 @@ class Trainer:
             "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
             "environment": resuming.state_of(self.environment),
-            "last_episodes": self.last_episodes.blocks,
+            "last_episodes": self.last_episodes.saved(),
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
             "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }

@@ -26,6 +26,19 @@ def generalised_advantages(
     return result
 
 
+@kernel
+def advantages_and_returns(rewards, outputs, worthless, scale, discount, gae_lambda):
+    """Advantages and λ-returns, float64 [T] each, of rewards over their `scale`.
+
+    outputs: the critic's, float32 [T + 1, 1]; worthless: whether the last state is worth 0.
+    """
+    values = outputs[:, 0].astype(np.float64)
+    if worthless:
+        values[-1] = 0.0
+    advantages = generalised_advantages(rewards / scale, values, discount, gae_lambda)
+    return advantages, advantages + values[:-1]
+
+
 def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
     """The discounted return-to-go of each step as it was paid, [T].
 

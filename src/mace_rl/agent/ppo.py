@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mace_rl.agent.advantages import generalised_advantages
+from mace_rl.agent.advantages import advantages_and_returns
 from mace_rl.agent.learner import Batch, Learner, Minibatches, Update
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
@@ -83,16 +83,13 @@ class PPO(ActorCritic, Stateful):
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
-            rewards = rewards / self.reward_scale(kind)
-        values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
-        if terminated or not self.config.bootstrap_at_time_limit:
-            values[-1] = 0.0
-        advantages = generalised_advantages(
-            rewards, values, self.config.discount, self.config.gae_lambda
-        )
+        values = self.critics[kind].outputs(observations)
+        worthless = terminated or not self.config.bootstrap_at_time_limit
+        settings = self.reward_scale(kind), self.config.discount, self.config.gae_lambda
+        advantages, returns = advantages_and_returns(rewards, values, worthless, *settings)
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
-        return advantages, advantages + values[:-1]
+        return advantages, returns
 
     def reward_scale(self, kind: str) -> float:
         """The divisor of one kind of rewards."""

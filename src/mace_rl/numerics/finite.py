@@ -42,11 +42,11 @@ def require_within(
     name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
 ) -> None:
     """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`] ± `rounding`."""
-    require_finite(name, values)
     found = np.asarray(values)
-    outside = found[(found < -rounding) | (found > largest + rounding)].ravel()
-    if len(outside):
-        raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, {largest:g}]")
+    if not all_within(found, -rounding, largest + rounding):
+        require_finite(name, values)
+        outside = found[(found < -rounding) | (found > largest + rounding)].ravel()[0]
+        raise NonFiniteError(f"{name} is {outside}, which is not in [0, {largest:g}]")
 
 
 @njit(cache=True)
@@ -55,4 +55,13 @@ def all_below(values: np.ndarray, bound: float) -> bool:
     good = True
     for value in values.flat:
         good &= abs(value) < bound
+    return good
+
+
+@njit(cache=True)
+def all_within(values: np.ndarray, low: float, high: float) -> bool:
+    """Whether all numbers of such an array are in [low, high]; NaN is not."""
+    good = True
+    for value in values.flat:
+        good &= low <= value <= high
     return good
