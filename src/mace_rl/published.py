@@ -317,10 +317,9 @@ class PublishedTrainer(Trainer):
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward of one episode."""
         [item] = rollout
+        returns = item.extrinsic_returns.astype(np.float32)
         with drawing_from(self.ppo.draws):
-            update, values = self.ppo.update(
-                item.episode, item.extrinsic_returns.astype(np.float32)
-            )
+            update, values = self.ppo.update(item.episode, returns)
         for name, network in (("actor", self.ppo.policy), *self.ppo.critics.items()):
             require_finite(f"a weight of the {name}", network.parameters)
         rollout[0] = replace(item, extrinsic_advantages=item.extrinsic_returns - values)

@@ -42,15 +42,11 @@ class EpisodicMemory(Stateful):
         keys, next_states: [N, key]; rewards, returns: [N]. Of more than `capacity` the last ones
         are stored. All that was read since the last `write` was used at the same time, before it.
         """
-        self.usage[self.read], self.read[:] = self.time + 1, False
         self.time += 2
-        new = least_recently_used(self.usage, self.number, min(len(keys), len(self.keys)))
-        values = np.column_stack([next_states, rewards, returns])
-        self.keys[new], self.values[new] = keys[-len(new) :], values[-len(new) :]
-        self.usage[new], self.number[new] = self.time, self.written + np.arange(1, len(new) + 1)
-        before = self.newest_first[self.number[self.newest_first] <= self.written]
-        self.newest_first = np.concatenate([new[::-1], before])
-        self.written += len(new)
+        new, entries = (keys, next_states, rewards, returns), (self.keys, self.values)
+        when = self.usage, self.number, self.read, self.time, self.written
+        self.newest_first = write(new, entries, when, self.newest_first)
+        self.written += min(len(keys), len(self.keys))
         self.stored, self.neighbours = len(self.newest_first), None
 
     def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
@@ -78,6 +74,34 @@ class EpisodicMemory(Stateful):
         super().load_state_dict(state)
         self.newest_first = np.argsort(-self.number[: len(self)])
         self.neighbours = None
+
+
+@kernel
+def write(new, entries, when, newest_first):
+    """`EpisodicMemory.write`, in its arrays; returns `newest_first` as it is then."""
+    (keys, next_states, rewards, returns), (usage, number, read, time, written) = new, when
+    for entry in range(len(usage)):
+        if read[entry]:
+            usage[entry], read[entry] = time - 1, False
+    oldest = least_recently_used(usage, number, min(len(keys), len(usage)))
+    order = np.empty(len(usage), np.int64)
+    size, count, first = keys.shape[1], len(oldest), len(keys) - len(oldest)
+    for n in range(count):
+        entry, given = oldest[n], first + n
+        order[count - 1 - n] = entry
+        entries[0][entry] = keys[given]
+        value = entries[1][entry]
+        value[:size], value[size], value[size + 1] = (
+            next_states[given],
+            rewards[given],
+            returns[given],
+        )
+        usage[entry], number[entry] = time, written + n + 1
+    for entry in newest_first:
+        if number[entry] <= written:
+            order[count] = entry
+            count += 1
+    return order[:count]
 
 
 @kernel
