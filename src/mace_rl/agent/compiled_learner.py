@@ -82,7 +82,7 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
 
     steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
 
-    Returns the fields of an `Update`, with this network's gradient norm.
+    Returns the fields of an `Update`, with this network's gradient norm alone.
     """
     parameters, count = adam.parameters, len(steps.advantages)
     log_std = own_part(parameters, sizes)
