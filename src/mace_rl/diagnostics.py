@@ -35,17 +35,17 @@ def diagnose(
     done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
-    def stacked(name: str) -> np.ndarray:
-        return joined(getattr(item, name) for item in rollout)
-
     def explained(kind: str) -> float:
-        return explained_variance(stacked(f"{kind}_advantages"), stacked(f"{kind}_returns"))
+        parts = joined(rollout, f"{kind}_advantages"), joined(rollout, f"{kind}_returns")
+        return explained_variance(*parts)
 
     def mean_of(part: str) -> float:
         if getattr(rollout[0].bonus, part, None) is None:  # plain PPO, or another bonus
             return math.nan
-        return mean(joined(getattr(item.bonus, part) for item in rollout))
+        return mean(joined(rollout, f"bonus.{part}"))
 
+    own, added = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_share")
+    extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
         update=number,
@@ -60,7 +60,7 @@ def diagnose(
         gradient_norm_extrinsic=update.gradient_norms["extrinsic"],
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),
         beta=sum(item.beta for item in rollout) / len(rollout),
-        bonus_share=share(stacked("intrinsic_share"), stacked("extrinsic_part")),
+        bonus_share=weighted / (extrinsic + weighted) if extrinsic + weighted > 0 else math.nan,
         novelty=mean_of("novelty"),
         relevance=mean_of("relevance"),
         similarity=mean_of("similarity"),
@@ -73,10 +73,3 @@ def explained_variance(advantages, returns):
     """1 - Var(return - V) / Var(return), where a return minus V is the advantage; else NaN."""
     spread = variance(returns)
     return 1 - variance(advantages) / spread if spread > 0 else math.nan
-
-
-@kernel
-def share(part, rest):
-    """Σ part² / (Σ part² + Σ rest²); NaN if there is nothing."""
-    own, both = dot(part, part), dot(rest, rest) + dot(part, part)
-    return own / both if both > 0 else math.nan

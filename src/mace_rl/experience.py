@@ -1,9 +1,9 @@
 """The rollout of an update: episodes with their bonus, advantages and returns."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -26,6 +26,11 @@ class Experience:
     intrinsic_returns: np.ndarray
     extrinsic_scale: float  # `PPO.advantage_scale`, by which the advantages are divided
     intrinsic_scale: float
+
+    @property
+    def acted_on(self) -> np.ndarray:
+        """The observations before the last."""
+        return self.observations[:-1]
 
     @cached_property
     def extrinsic_part(self) -> np.ndarray:
@@ -60,13 +65,12 @@ class Experience:
         return replace(self, **new)
 
 
-def joined(pieces: Iterable[np.ndarray]) -> np.ndarray:
-    """What the episodes of a rollout have, one after the other, [N, …]; of one episode its own."""
-    found = list(pieces)
-    return found[0] if len(found) == 1 else np.concatenate(found)
+def joined(rollout: list[Experience], name: str) -> np.ndarray:
+    """An attribute of the episodes, "episode.actions" say, one after the other: [N, …]."""
+    pieces = [attrgetter(name)(item) for item in rollout]
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
 
 def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
     """Observations, [N, observation], and actions of the episodes, one after the other."""
-    observations = joined(item.observations[:-1] for item in rollout)
-    return observations, joined(item.episode.actions for item in rollout)
+    return joined(rollout, "acted_on"), joined(rollout, "episode.actions")

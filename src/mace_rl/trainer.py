@@ -169,28 +169,22 @@ class Trainer:
         if not self.controller.learns:
             return None
         centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
-        extrinsic = joined(item.extrinsic_part for item in rollout)
-        intrinsic = joined(item.intrinsic_part for item in rollout)
-        total_advantages = joined(item.total_advantages for item in rollout)
+        extrinsic, intrinsic = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_part")
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
-        change = normalised_change(total_advantages, intrinsic, centred)
+        change = normalised_change(joined(rollout, "total_advantages"), intrinsic, centred)
         gradient, change = learner.policy_gradients(*steps(rollout), [extrinsic, change])
         effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        returns = {"extrinsic": joined(item.extrinsic_returns for item in rollout)}
-        if self.curiosity is not None:
-            returns["intrinsic"] = joined(item.intrinsic_returns for item in rollout)
-        total_advantages = joined(item.total_advantages for item in rollout)
-        advantages = normalised(total_advantages, self.config.ppo.centre_advantages)
-        log_probs = joined(item.episode.log_probs for item in rollout)
+        returns = {kind: joined(rollout, f"{kind}_returns") for kind in self.ppo.critics}
+        centred = self.config.ppo.centre_advantages
+        advantages = normalised(joined(rollout, "total_advantages"), centred)
+        log_probs = joined(rollout, "episode.log_probs")
         batch = Batch(*steps(rollout), log_probs, advantages.astype(np.float32))
-        update = self.ppo.update(
-            batch, {kind: values.astype(np.float32) for kind, values in returns.items()}
-        )
+        update = self.ppo.update(batch, returns)
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.

@@ -10,12 +10,12 @@ from mace_rl.numerics.products import dot
 @kernel
 def generalised_advantages(
     rewards: np.ndarray, values: np.ndarray, discount: float, gae_lambda: float
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Generalised advantage estimation over one episode (Schulman et al. 2016, eq. 16).
 
     rewards: [T]; values: [T + 1], V(s_0) … V(s_T), where V(s_T) is 0 if s_T is terminal and the
-    critic's value if the time limit cut the episode off. Returns float64 [T]; adding values[:T]
-    gives the λ-returns.
+    critic's value if the time limit cut the episode off. Returns them, and with values[:T] added
+    the λ-returns, float64 [T] each.
     """
     result = np.empty(len(rewards))
     following = 0.0
@@ -23,20 +23,7 @@ def generalised_advantages(
         delta = rewards[t] + discount * values[t + 1] - values[t]
         following = delta + discount * gae_lambda * following
         result[t] = following
-    return result
-
-
-@kernel
-def advantages_and_returns(rewards, outputs, worthless, scale, discount, gae_lambda):
-    """Advantages and λ-returns, float64 [T] each, of rewards over their `scale`.
-
-    outputs: the critic's, float32 [T + 1, 1]; worthless: whether the last state is worth 0.
-    """
-    values = outputs[:, 0].astype(np.float64)
-    if worthless:
-        values[-1] = 0.0
-    advantages = generalised_advantages(rewards / scale, values, discount, gae_lambda)
-    return advantages, advantages + values[:-1]
+    return result, result + values[:-1]
 
 
 def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
@@ -44,7 +31,7 @@ def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
 
     Without what a critic guesses for the rest, which early on differs by more than what is paid.
     """
-    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)
+    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)[0]
 
 
 @kernel

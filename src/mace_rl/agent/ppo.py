@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mace_rl.agent.advantages import advantages_and_returns
+from mace_rl.agent.advantages import generalised_advantages
 from mace_rl.agent.learner import Batch, Learner, Minibatches, Update
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
@@ -83,10 +83,12 @@ class PPO(ActorCritic, Stateful):
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
-        values = self.critics[kind].outputs(observations)
-        worthless = terminated or not self.config.bootstrap_at_time_limit
-        settings = self.reward_scale(kind), self.config.discount, self.config.gae_lambda
-        advantages, returns = advantages_and_returns(rewards, values, worthless, *settings)
+            rewards = rewards / self.reward_scale(kind)
+        values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
+        if terminated or not self.config.bootstrap_at_time_limit:
+            values[-1] = 0.0
+        discounts = self.config.discount, self.config.gae_lambda
+        advantages, returns = generalised_advantages(rewards, values, *discounts)
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
         return advantages, returns
@@ -105,7 +107,8 @@ class PPO(ActorCritic, Stateful):
 
     def update(self, batch: Batch, returns: Mapping[str, np.ndarray]) -> Update:
         """K epochs over `batch`; returns: for each critic the λ-returns of its steps."""
-        return self.learner.update(batch, returns, self.minibatches(len(batch.advantages)))
+        targets = {kind: values.astype(np.float32) for kind, values in returns.items()}
+        return self.learner.update(batch, targets, self.minibatches(len(batch.advantages)))
 
     def minibatches(self, count: int) -> Minibatches:
         """The minibatches of an update on `count` steps: in random order, unless there is one."""

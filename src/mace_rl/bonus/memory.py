@@ -17,7 +17,7 @@ class EpisodicMemory(Stateful):
     value is (next state, reward, return-to-go): what followed the state.
     """
 
-    STATE = ("keys", "values", "usage", "number", "read", "time", "written", "stored")
+    STATE = ("keys", "values", "usage", "number", "read", "time", "written")
 
     def __init__(self, config: MemoryConfig, key_size: int) -> None:
         self.config = config
@@ -26,13 +26,13 @@ class EpisodicMemory(Stateful):
         self.usage = np.zeros(config.capacity, np.int64)  # time of the last reading or writing
         # Their number among all that were ever written, from 1; below 0 for empty ones.
         self.number = np.arange(-config.capacity, 0)
-        self.time = self.written = self.stored = 0
+        self.time = self.written = 0
         self.newest_first = np.empty(0, np.int64)  # entries, from the last written on
         self.read = np.zeros(config.capacity, np.bool_)  # entries read since the last `write`
         self.neighbours: Neighbours | None = None
 
     def __len__(self) -> int:
-        return self.stored
+        return min(self.written, len(self.keys))
 
     def write(
         self, keys: np.ndarray, next_states: np.ndarray, rewards: np.ndarray, returns: np.ndarray
@@ -47,7 +47,7 @@ class EpisodicMemory(Stateful):
         when = self.usage, self.number, self.read, self.time, self.written
         self.newest_first = write(new, entries, when, self.newest_first)
         self.written += min(len(keys), len(self.keys))
-        self.stored, self.neighbours = len(self.newest_first), None
+        self.neighbours = None
 
     def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
         """From now on distances are Euclidean between (x - mean) / std; both are [key]."""
@@ -85,18 +85,14 @@ def write(new, entries, when, newest_first):
             usage[entry], read[entry] = time - 1, False
     oldest = least_recently_used(usage, number, min(len(keys), len(usage)))
     order = np.empty(len(usage), np.int64)
-    size, count, first = keys.shape[1], len(oldest), len(keys) - len(oldest)
+    count = len(oldest)
     for n in range(count):
-        entry, given = oldest[n], first + n
-        order[count - 1 - n] = entry
-        entries[0][entry] = keys[given]
-        value = entries[1][entry]
-        value[:size], value[size], value[size + 1] = (
-            next_states[given],
-            rewards[given],
-            returns[given],
-        )
+        entry, given = oldest[n], len(keys) - count + n
+        key, value = entries[0][entry], entries[1][entry]
+        key[:], value[:-2] = keys[given], next_states[given]
+        value[-2], value[-1] = rewards[given], returns[given]
         usage[entry], number[entry] = time, written + n + 1
+        order[count - 1 - n] = entry
     for entry in newest_first:
         if number[entry] <= written:
             order[count] = entry

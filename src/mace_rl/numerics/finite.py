@@ -42,9 +42,9 @@ def require_within(
     name: str, values: float | np.ndarray, rounding: float = 0.0, largest: float = 1.0
 ) -> None:
     """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`] ± `rounding`."""
+    require_finite(name, values)
     found = np.asarray(values)
-    if not all_within(found, -rounding, largest + rounding):
-        require_finite(name, values)
+    if found.min() < -rounding or found.max() > largest + rounding:
         outside = found[(found < -rounding) | (found > largest + rounding)].ravel()[0]
         raise NonFiniteError(f"{name} is {outside}, which is not in [0, {largest:g}]")
 
@@ -55,13 +55,4 @@ def all_below(values: np.ndarray, bound: float) -> bool:
     good = True
     for value in values.flat:
         good &= abs(value) < bound
-    return good
-
-
-@njit(cache=True)
-def all_within(values: np.ndarray, low: float, high: float) -> bool:
-    """Whether all numbers of such an array are in [low, high]; NaN is not."""
-    good = True
-    for value in values.flat:
-        good &= low <= value <= high
     return good
