@@ -17,7 +17,7 @@ class Experience:
     """An episode with all that the update needs; arrays are [T]."""
 
     episode: Episode
-    observations: np.ndarray  # float32 [T + 1, observation], normalised as the networks see them
+    observations: np.ndarray  # float32 [T, observation], normalised as the networks see them
     beta: float
     bonus: Bonus | None  # None in plain PPO
     extrinsic_advantages: np.ndarray
@@ -26,11 +26,6 @@ class Experience:
     intrinsic_returns: np.ndarray
     extrinsic_scale: float  # `PPO.advantage_scale`, by which the advantages are divided
     intrinsic_scale: float
-
-    @property
-    def acted_on(self) -> np.ndarray:
-        """The observations before the last."""
-        return self.observations[:-1]
 
     @cached_property
     def extrinsic_part(self) -> np.ndarray:
@@ -69,8 +64,3 @@ def joined(rollout: list[Experience], name: str) -> np.ndarray:
     """An attribute of the episodes, "episode.actions" say, one after the other: [N, …]."""
     pieces = [attrgetter(name)(item) for item in rollout]
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-
-
-def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
-    """Observations, [N, observation], and actions of the episodes, one after the other."""
-    return joined(rollout, "acted_on"), joined(rollout, "episode.actions")

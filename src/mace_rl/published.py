@@ -308,7 +308,7 @@ class PublishedTrainer(Trainer):
         returns = paid_returns(episode.rewards + beta * weighed, self.config.ppo.discount)
         states, none = episode.observations, np.zeros(len(episode))
         unknown = np.nan  # how the two rewards share in what one critic learns
-        given = episode, states, printed, bonus, returns, returns, none, none
+        given = episode, states[:-1], printed, bonus, returns, returns, none, none
         return Experience(*given, extrinsic_scale=1.0, intrinsic_scale=unknown)
 
     def adapt(self, rollout: list[Experience]) -> None:

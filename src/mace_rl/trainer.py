@@ -23,7 +23,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import Experience, joined, steps
+from mace_rl.experience import Experience, joined
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
@@ -131,7 +131,7 @@ class Trainer:
         self._record(episode, reward, beta)
         return Experience(
             episode=episode,
-            observations=observations,
+            observations=observations[:-1],
             beta=beta,
             bonus=bonus,
             extrinsic_advantages=extrinsic_advantages,
@@ -173,7 +173,8 @@ class Trainer:
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
         change = normalised_change(joined(rollout, "total_advantages"), intrinsic, centred)
-        gradient, change = learner.policy_gradients(*steps(rollout), [extrinsic, change])
+        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
+        gradient, change = learner.policy_gradients(*acted, [extrinsic, change])
         effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
@@ -181,9 +182,9 @@ class Trainer:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         returns = {kind: joined(rollout, f"{kind}_returns") for kind in self.ppo.critics}
         centred = self.config.ppo.centre_advantages
-        advantages = normalised(joined(rollout, "total_advantages"), centred)
-        log_probs = joined(rollout, "episode.log_probs")
-        batch = Batch(*steps(rollout), log_probs, advantages.astype(np.float32))
+        advantages = normalised(joined(rollout, "total_advantages"), centred).astype(np.float32)
+        acted = ("observations", "episode.actions", "episode.log_probs")
+        batch = Batch(*(joined(rollout, name) for name in acted), advantages)
         update = self.ppo.update(batch, returns)
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)

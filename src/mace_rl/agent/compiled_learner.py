@@ -110,8 +110,8 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
                 own[:] = 0
             norm = step(gradient, adam)
             first = end
-    acted = taken(steps.log_probs, minibatches.epochs[-1])
-    return norm, *policy_change(new_log_probs, acted, clip), mean(entropies)
+    old_log_probs = taken(steps.log_probs, minibatches.epochs[-1])
+    return norm, *policy_change(new_log_probs, old_log_probs, clip), mean(entropies)
 
 
 @kernel

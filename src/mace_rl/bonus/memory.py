@@ -83,11 +83,12 @@ def write(new, entries, when, newest_first):
     for entry in range(len(usage)):
         if read[entry]:
             usage[entry], read[entry] = time - 1, False
-    oldest = least_recently_used(usage, number, min(len(keys), len(usage)))
-    order = np.empty(len(usage), np.int64)
-    count = len(oldest)
+    # Of equally used ones the first written goes: a long episode reads nearly every entry.
+    age, order = usage * 2**32 + number, np.empty(len(usage), np.int64)
+    count = min(len(keys), len(usage))
     for n in range(count):
-        entry, given = oldest[n], len(keys) - count + n
+        entry, given = np.argmin(age), len(keys) - count + n
+        age[entry] = 2**62
         key, value = entries[0][entry], entries[1][entry]
         key[:], value[:-2] = keys[given], next_states[given]
         value[-2], value[-1] = rewards[given], returns[given]
@@ -98,22 +99,6 @@ def write(new, entries, when, newest_first):
             order[count] = entry
             count += 1
     return order[:count]
-
-
-@kernel
-def least_recently_used(usage: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
-    """`count` entries in order, int64; of the many that are equally used, the first written."""
-    oldest, ages, found = np.empty(count, np.int64), np.empty(count, np.int64), 0  # ascending
-    for entry in range(len(usage)):
-        age = usage[entry] * 2**32 + number[entry]
-        if found == count and age > ages[-1]:
-            continue
-        place, found = min(found, count - 1), min(found + 1, count)
-        while place > 0 and ages[place - 1] > age:
-            oldest[place], ages[place] = oldest[place - 1], ages[place - 1]
-            place -= 1
-        oldest[place], ages[place] = entry, age
-    return oldest
 
 
 @kernel

@@ -70,11 +70,9 @@ class LastEpisodes:
     def saved(self) -> list[list[dict[str, Any]]]:
         """For a checkpoint."""
         for one in itertools.chain.from_iterable(self.blocks):
-            if isinstance(one["outcome"], Episode):
-                one |= {
-                    "actions": torch.from_numpy(one["actions"]),
-                    "outcome": _digest(one["outcome"]),
-                }
+            if isinstance(episode := one["outcome"], Episode):
+                actions = torch.from_numpy(episode.actions)
+                one |= {"actions": actions, "outcome": _digest(episode)}
         return self.blocks
 
 
