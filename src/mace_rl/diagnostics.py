@@ -69,7 +69,7 @@ def diagnose(
 
 
 @kernel
-def explained_variance(advantages, returns):
+def explained_variance(advantages: np.ndarray, returns: np.ndarray) -> float:
     """1 - Var(return - V) / Var(return), where a return minus V is the advantage; else NaN."""
     spread = variance(returns)
     return 1 - variance(advantages) / spread if spread > 0 else math.nan

@@ -62,5 +62,5 @@ class Experience:
 
 def joined(rollout: list[Experience], name: str) -> np.ndarray:
     """An attribute of the episodes, "episode.actions" say, one after the other: [N, …]."""
-    pieces = [attrgetter(name)(item) for item in rollout]
-    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+    part = attrgetter(name)
+    return part(rollout[0]) if len(rollout) == 1 else np.concatenate([*map(part, rollout)])

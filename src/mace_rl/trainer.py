@@ -183,9 +183,9 @@ class Trainer:
         returns = {kind: joined(rollout, f"{kind}_returns") for kind in self.ppo.critics}
         centred = self.config.ppo.centre_advantages
         advantages = normalised(joined(rollout, "total_advantages"), centred).astype(np.float32)
-        acted = ("observations", "episode.actions", "episode.log_probs")
-        batch = Batch(*(joined(rollout, name) for name in acted), advantages)
-        update = self.ppo.update(batch, returns)
+        log_probs = joined(rollout, "episode.log_probs")
+        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
+        update = self.ppo.update(Batch(*acted, log_probs, advantages), returns)
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
