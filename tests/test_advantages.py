@@ -32,7 +32,7 @@ def test_advantages_are_the_weighted_mean_of_k_step_ones(discount, gae_lambda):
             (1 - gae_lambda) * gae_lambda ** (k - 1) * k_step(t, k) for k in range(1, most)
         )
         expected.append(weighted + gae_lambda ** (most - 1) * k_step(t, most))
-    found = generalised_advantages(rewards, values, discount, gae_lambda)
+    found, _ = generalised_advantages(rewards, values, discount, gae_lambda)
     np.testing.assert_allclose(found, expected)
 
 

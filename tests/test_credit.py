@@ -102,7 +102,7 @@ class Watched(Trainer):
         policy = learner.parameters["actor"].copy()
         unit = 1 / learner.preconditioned(np.ones(len(policy), np.float32))
         credit = super().adapt(rollout)
-        direction = self.controller.judge.pending[-1].direction.copy()
+        direction = self.controller.judge.directions[-1].copy()
         self.rounds.append(Round(rollout, policy, unit, direction))
         return credit
 
@@ -146,7 +146,7 @@ def policy_gradient(watched, each: Round, advantages: np.ndarray) -> np.ndarray:
     """∇ mean(log π · A) over a round's steps, by autograd, of the policy that played it."""
     watched.ppo.policy.parameters[:] = each.policy
     other = Twin(watched.ppo.policy)
-    observations = np.concatenate([item.observations[:-1] for item in each.rollout])
+    observations = np.concatenate([item.observations for item in each.rollout])
     actions = np.concatenate([item.episode.actions for item in each.rollout])
     log_probs = other.policy(observations).log_prob(torch.from_numpy(actions))
     return other.gradient((log_probs * torch.from_numpy(advantages)).mean())

@@ -139,7 +139,7 @@ class CuriosityTracker(Stateful):
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 5,  # of the state itself
+            "form": 6,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

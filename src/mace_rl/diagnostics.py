@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from mace_rl.agent.learner import Update
-from mace_rl.experience import Experience
+from mace_rl.experience import Experience, joined
 from mace_rl.numerics.arrays import mean, variance
+from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.numerics.products import dot
 from mace_rl.records import UpdateRecord
@@ -34,22 +35,16 @@ def diagnose(
     done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
-    def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(item, name) for item in rollout])
-
-    def explained_variance(kind: str) -> float:
-        spread = variance(stacked(f"{kind}_returns"))
-        # A return minus the critic's value is the advantage.
-        left = variance(stacked(f"{kind}_advantages"))
-        return 1 - left / spread if spread > 0 else math.nan
+    def explained(kind: str) -> float:
+        parts = joined(rollout, f"{kind}_advantages"), joined(rollout, f"{kind}_returns")
+        return explained_variance(*parts)
 
     def mean_of(part: str) -> float:
         if getattr(rollout[0].bonus, part, None) is None:  # plain PPO, or another bonus
             return math.nan
-        return mean(np.concatenate([getattr(item.bonus, part) for item in rollout]))
+        return mean(joined(rollout, f"bonus.{part}"))
 
-    has_bonus = rollout[0].bonus is not None
-    own, added = stacked("extrinsic_part"), stacked("intrinsic_share")
+    own, added = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_share")
     extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
@@ -59,8 +54,8 @@ def diagnose(
         approximate_kl=update.approximate_kl,
         clip_fraction=update.clip_fraction,
         entropy=update.entropy,
-        explained_variance_extrinsic=explained_variance("extrinsic"),
-        explained_variance_intrinsic=explained_variance("intrinsic") if has_bonus else math.nan,
+        explained_variance_extrinsic=explained("extrinsic"),
+        explained_variance_intrinsic=explained("intrinsic"),
         gradient_norm_actor=update.gradient_norms["actor"],
         gradient_norm_extrinsic=update.gradient_norms["extrinsic"],
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),
@@ -71,3 +66,10 @@ def diagnose(
         similarity=mean_of("similarity"),
         beta_credit=math.nan if credit is None else credit,
     )
+
+
+@kernel
+def explained_variance(advantages: np.ndarray, returns: np.ndarray) -> float:
+    """1 - Var(return - V) / Var(return), where a return minus V is the advantage; else NaN."""
+    spread = variance(returns)
+    return 1 - variance(advantages) / spread if spread > 0 else math.nan

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -16,7 +17,7 @@ class Experience:
     """An episode with all that the update needs; arrays are [T]."""
 
     episode: Episode
-    observations: np.ndarray  # float32 [T + 1, observation], normalised as the networks see them
+    observations: np.ndarray  # float32 [T, observation], normalised as the networks see them
     beta: float
     bonus: Bonus | None  # None in plain PPO
     extrinsic_advantages: np.ndarray
@@ -41,6 +42,11 @@ class Experience:
         """β A_I."""
         return self.beta * self.intrinsic_part
 
+    @cached_property
+    def total_advantages(self) -> np.ndarray:
+        """A_E + β A_I."""
+        return self.extrinsic_part + self.intrinsic_share
+
     def with_normalised_returns(self) -> "Experience":
         """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
         old = {k: getattr(self, f"{k}_returns") for k in ("extrinsic", "intrinsic")}
@@ -54,17 +60,7 @@ class Experience:
         return replace(self, **new)
 
 
-def steps(rollout: list[Experience]) -> tuple[np.ndarray, np.ndarray]:
-    """Observations, [N, observation], and actions of the episodes, one after the other."""
-    observations = np.concatenate([item.observations[:-1] for item in rollout])
-    return observations, np.concatenate([item.episode.actions for item in rollout])
-
-
-def joined(pieces: list[np.ndarray]) -> np.ndarray:
-    """The episodes' arrays one after the other, float32 [N]."""
-    return np.concatenate(pieces).astype(np.float32)
-
-
-def total_advantages(rollout: list[Experience]) -> np.ndarray:
-    """A_E + β A_I of every step, float64 [N]."""
-    return np.concatenate([item.extrinsic_part + item.intrinsic_share for item in rollout])
+def joined(rollout: list[Experience], name: str) -> np.ndarray:
+    """An attribute of the episodes, "episode.actions" say, one after the other: [N, …]."""
+    part = attrgetter(name)
+    return part(rollout[0]) if len(rollout) == 1 else np.concatenate([*map(part, rollout)])

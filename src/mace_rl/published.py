@@ -33,7 +33,7 @@ from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 from mace_rl.environments.spaces import Spaces
-from mace_rl.experience import Experience, joined
+from mace_rl.experience import Experience
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
@@ -308,7 +308,7 @@ class PublishedTrainer(Trainer):
         returns = paid_returns(episode.rewards + beta * weighed, self.config.ppo.discount)
         states, none = episode.observations, np.zeros(len(episode))
         unknown = np.nan  # how the two rewards share in what one critic learns
-        given = episode, states, printed, bonus, returns, returns, none, none
+        given = episode, states[:-1], printed, bonus, returns, returns, none, none
         return Experience(*given, extrinsic_scale=1.0, intrinsic_scale=unknown)
 
     def adapt(self, rollout: list[Experience]) -> None:
@@ -317,8 +317,9 @@ class PublishedTrainer(Trainer):
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward of one episode."""
         [item] = rollout
+        returns = item.extrinsic_returns.astype(np.float32)
         with drawing_from(self.ppo.draws):
-            update, values = self.ppo.update(item.episode, joined([item.extrinsic_returns]))
+            update, values = self.ppo.update(item.episode, returns)
         for name, network in (("actor", self.ppo.policy), *self.ppo.critics.items()):
             require_finite(f"a weight of the {name}", network.parameters)
         rollout[0] = replace(item, extrinsic_advantages=item.extrinsic_returns - values)

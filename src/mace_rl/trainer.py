@@ -23,7 +23,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import Experience, joined, steps, total_advantages
+from mace_rl.experience import Experience, joined
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
@@ -131,7 +131,7 @@ class Trainer:
         self._record(episode, reward, beta)
         return Experience(
             episode=episode,
-            observations=observations,
+            observations=observations[:-1],
             beta=beta,
             bonus=bonus,
             extrinsic_advantages=extrinsic_advantages,
@@ -169,29 +169,23 @@ class Trainer:
         if not self.controller.learns:
             return None
         centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
-        extrinsic = np.concatenate([item.extrinsic_part for item in rollout])
-        intrinsic = np.concatenate([item.intrinsic_part for item in rollout])
+        extrinsic, intrinsic = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_part")
         if centred:
-            extrinsic -= mean(extrinsic)
-        change = normalised_change(total_advantages(rollout), intrinsic, centred)
-        gradient, change = learner.policy_gradients(*steps(rollout), [extrinsic, change])
+            extrinsic = extrinsic - mean(extrinsic)
+        change = normalised_change(joined(rollout, "total_advantages"), intrinsic, centred)
+        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
+        gradient, change = learner.policy_gradients(*acted, [extrinsic, change])
         effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
     def improve(self, rollout: list[Experience]) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        returns = {"extrinsic": joined([item.extrinsic_returns for item in rollout])}
-        if self.curiosity is not None:
-            returns["intrinsic"] = joined([item.intrinsic_returns for item in rollout])
-        advantages = normalised(total_advantages(rollout), self.config.ppo.centre_advantages)
-        update = self.ppo.update(
-            Batch(
-                *steps(rollout),
-                log_probs=joined([item.episode.log_probs for item in rollout]),
-                advantages=advantages.astype(np.float32),
-            ),
-            returns,
-        )
+        returns = {kind: joined(rollout, f"{kind}_returns") for kind in self.ppo.critics}
+        centred = self.config.ppo.centre_advantages
+        advantages = normalised(joined(rollout, "total_advantages"), centred).astype(np.float32)
+        log_probs = joined(rollout, "episode.log_probs")
+        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
+        update = self.ppo.update(Batch(*acted, log_probs, advantages), returns)
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
@@ -215,7 +209,7 @@ class Trainer:
             "controller": self.controller.state_dict() if self.controller is not None else None,
             "noise": self.noise.bit_generator.state,
             "environment": resuming.state_of(self.environment),
-            "last_episodes": self.last_episodes.blocks,
+            "last_episodes": self.last_episodes.saved(),
             "records": as_tensors(as_columns(EpisodeRecord, self.records)),
             "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
         }

@@ -10,12 +10,12 @@ from mace_rl.numerics.products import dot
 @kernel
 def generalised_advantages(
     rewards: np.ndarray, values: np.ndarray, discount: float, gae_lambda: float
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Generalised advantage estimation over one episode (Schulman et al. 2016, eq. 16).
 
     rewards: [T]; values: [T + 1], V(s_0) … V(s_T), where V(s_T) is 0 if s_T is terminal and the
-    critic's value if the time limit cut the episode off. Returns float64 [T]; adding values[:T]
-    gives the λ-returns.
+    critic's value if the time limit cut the episode off. Returns them, and with values[:T] added
+    the λ-returns, float64 [T] each.
     """
     result = np.empty(len(rewards))
     following = 0.0
@@ -23,7 +23,7 @@ def generalised_advantages(
         delta = rewards[t] + discount * values[t + 1] - values[t]
         following = delta + discount * gae_lambda * following
         result[t] = following
-    return result
+    return result, result + values[:-1]
 
 
 def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
@@ -31,7 +31,7 @@ def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
 
     Without what a critic guesses for the rest, which early on differs by more than what is paid.
     """
-    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)
+    return generalised_advantages(rewards, np.zeros(len(rewards) + 1), discount, 1.0)[0]
 
 
 @kernel

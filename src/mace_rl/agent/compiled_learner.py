@@ -56,20 +56,18 @@ class CompiledLearner(Stateful):
         adam = {name: optimiser.state for name, optimiser in self.optimisers.items()}
         config, sizes = self.config, self.network.sizes
         loss = config.clip, config.entropy_coefficient, config.learn_log_std
-        norm, log_probs, entropies = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
+        norm, *change = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
         norms, seen = {"actor": norm}, batch.observations
         for kind, own in self.critics.items():
             norms[kind] = improve_values(seen, returns[kind], minibatches, own.sizes, adam[kind])
-        acted = batch.log_probs[minibatches.epochs[-1]]
-        return Update(norms, *policy_change(log_probs, acted, self.config.clip), mean(entropies))
+        return Update(norms, *change)
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
-        weights = np.stack([item / len(item) for item in advantages]).astype(np.float32)
         observations = np.ascontiguousarray(observations, np.float32)
-        network, parameters = self.network, self.policy.parameters
-        found = policy_gradients(observations, actions, weights, parameters, network.sizes)
+        network, parameters, several = self.network, self.policy.parameters, np.stack(advantages)
+        found = policy_gradients(observations, actions, several, parameters, network.sizes)
         if not self.config.learn_log_std:
             found[:, len(parameters) - len(self.policy.log_std) :] = 0
         return list(found)
@@ -84,8 +82,7 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
 
     steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
 
-    Returns the last minibatch's gradient norm, and for the steps of the last epoch in its order,
-    before each minibatch's update, log π(a|s), float32 [N], and the policy's entropy, [N].
+    Returns the fields of an `Update`, with this network's gradient norm alone.
     """
     parameters, count = adam.parameters, len(steps.advantages)
     log_std = own_part(parameters, sizes)
@@ -113,7 +110,8 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
                 own[:] = 0
             norm = step(gradient, adam)
             first = end
-    return norm, new_log_probs, entropies
+    old_log_probs = taken(steps.log_probs, minibatches.epochs[-1])
+    return norm, *policy_change(new_log_probs, old_log_probs, clip), mean(entropies)
 
 
 @kernel
@@ -141,8 +139,9 @@ def improve_values(observations, returns, minibatches, sizes, adam):
 
 
 @kernel
-def policy_gradients(observations, actions, weights, parameters, sizes):
-    """∇_θ Σ_t w_t log π(a_t|s_t) for each row of weights, float32 [K, N]; float32 [K, n]."""
+def policy_gradients(observations, actions, advantages, parameters, sizes):
+    """∇_θ of the mean of log π(a|s) · A for each row of advantages, [K, N]; float32 [K, n]."""
+    weights = (advantages / len(observations)).astype(np.float32)
     log_std, back = own_part(parameters, sizes), transposed(parameters, sizes)
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradients = np.zeros((len(weights), len(parameters)), np.float32)

@@ -87,12 +87,11 @@ class PPO(ActorCritic, Stateful):
         values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
         if terminated or not self.config.bootstrap_at_time_limit:
             values[-1] = 0.0
-        advantages = generalised_advantages(
-            rewards, values, self.config.discount, self.config.gae_lambda
-        )
+        discounts = self.config.discount, self.config.gae_lambda
+        advantages, returns = generalised_advantages(rewards, values, *discounts)
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
-        return advantages, advantages + values[:-1]
+        return advantages, returns
 
     def reward_scale(self, kind: str) -> float:
         """The divisor of one kind of rewards."""
@@ -108,7 +107,8 @@ class PPO(ActorCritic, Stateful):
 
     def update(self, batch: Batch, returns: Mapping[str, np.ndarray]) -> Update:
         """K epochs over `batch`; returns: for each critic the λ-returns of its steps."""
-        return self.learner.update(batch, returns, self.minibatches(len(batch.advantages)))
+        targets = {kind: values.astype(np.float32) for kind, values in returns.items()}
+        return self.learner.update(batch, targets, self.minibatches(len(batch.advantages)))
 
     def minibatches(self, count: int) -> Minibatches:
         """The minibatches of an update on `count` steps: in random order, unless there is one."""

@@ -10,27 +10,15 @@ depends on β is therefore, up to a positive factor (Xu et al. 2018),
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from mace_rl.beta.controller import Effect
 from mace_rl.config.beta import MetaConfig
 from mace_rl.numerics.products import dot
-from mace_rl.state import Stateful, restored, saved
+from mace_rl.state import Stateful
 
 SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
-
-
-@dataclass
-class PendingCredit:
-    """The β of one rollout, while the updates that follow tell what it did."""
-
-    direction: np.ndarray  # what it changes in the policy, of length 1, or 0
-    strength: float  # of the bonus in that update, at most 1
-    credit: float = 0.0
-    updates: int = 0  # that judged it so far
 
 
 class Judge(Stateful):
@@ -41,53 +29,48 @@ class Judge(Stateful):
     bonus weighs nothing, there is no signal.
     """
 
-    STATE = ("alignments", "alignment_weight")
+    STATE = ("directions", "strengths", "credits", "alignments", "alignment_weight")
 
     def __init__(self, config: MetaConfig) -> None:
         self.horizon, self.bound = config.horizon, config.max_credit
-        self.pending: list[PendingCredit] = []
+        # Of each β that is being judged, the oldest first:
+        self.directions: list[np.ndarray] = []  # what it changes in the policy, of length 1, or 0
+        self.strengths: list[float] = []  # of the bonus in that update, at most 1
+        self.credits: list[float] = []
         self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 
     def judge(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
         """The credit of the β that has now been judged to the end; arguments as in `learn`."""
         self.credit_all(gradient, strength)
-        done = self.pending and self.pending[0].updates == self.horizon
-        first = self.pending.pop(0) if done else None
+        done = len(self.credits) == self.horizon
+        credit = self.bounded(self.credits[0]) if done else None
         length = math.sqrt(dot(effect.direction, effect.direction))
         direction = effect.direction / np.float32(length) if length > 0 else effect.direction
-        self.pending.append(PendingCredit(direction, min(1.0, effect.advantage_rms)))
-        return None if first is None else self.bounded(first.credit)
+        self.directions = [*self.directions[done:], direction]
+        self.strengths = [*self.strengths[done:], min(1.0, effect.advantage_rms)]
+        self.credits = [*self.credits[done:], 0.0]
+        return credit
 
     def credit_all(self, gradient: np.ndarray, strength: float) -> None:
         """Add one term to the credit of every β under judgement, in units of its usual size.
 
         That is a running root mean square, in which each update counts as one.
         """
-        for item in self.pending:
-            item.updates += 1
-        if not (self.pending and strength > 0):
+        if not (self.credits and strength > 0):
             return
-        along = [dot(gradient, item.direction) / strength for item in self.pending]
+        along = [dot(gradient, direction) / strength for direction in self.directions]
         squares = sum(value * value for value in along) / len(along)
         self.alignments = SCALE_DECAY * self.alignments + squares
         self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
         usual = math.sqrt(self.alignments / self.alignment_weight)
         if usual > 0:
-            for item, value in zip(self.pending, along, strict=True):
-                item.credit += value / usual * min(1.0, strength) * item.strength
+            terms = zip(along, self.strengths, strict=True)
+            added = [value / usual * min(1.0, strength) * own for value, own in terms]
+            self.credits = [a + b for a, b in zip(self.credits, added, strict=True)]
 
     def bounded(self, credit: float) -> float:
         """A sum of `horizon` terms as one whose noise has size 1, within `max_credit`."""
         return min(max(credit / math.sqrt(self.horizon), -self.bound), self.bound)
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Stateful`."""
-        return super().state_dict() | {"pending": [saved(vars(item)) for item in self.pending]}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
-        super().load_state_dict(state)
-        self.pending = [PendingCredit(**restored(None, item)) for item in state["pending"]]
 
 
 class Integrator(Stateful):

@@ -120,10 +120,8 @@ class Curiosity(Stateful, IntrinsicReward):
 
     def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.
-        every = memory.config.write_every
-        chosen = np.arange(-self.steps % every, len(episode), every)
-        if len(chosen) == 0 or chosen[-1] < len(episode) - 1:
-            chosen = np.append(chosen, len(episode) - 1)
+        every, last = memory.config.write_every, len(episode) - 1
+        chosen = np.array([*range(-self.steps % every, last, every), last])
         self.steps += len(episode)
         before, after = episode.observations[:-1], episode.observations[1:]
         memory.write(before[chosen], after[chosen], episode.rewards[chosen], returns[chosen])

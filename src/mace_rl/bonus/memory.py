@@ -17,7 +17,7 @@ class EpisodicMemory(Stateful):
     value is (next state, reward, return-to-go): what followed the state.
     """
 
-    STATE = ("keys", "values", "usage", "number", "read", "time", "written", "stored")
+    STATE = ("keys", "values", "usage", "number", "read", "time", "written")
 
     def __init__(self, config: MemoryConfig, key_size: int) -> None:
         self.config = config
@@ -26,13 +26,13 @@ class EpisodicMemory(Stateful):
         self.usage = np.zeros(config.capacity, np.int64)  # time of the last reading or writing
         # Their number among all that were ever written, from 1; below 0 for empty ones.
         self.number = np.arange(-config.capacity, 0)
-        self.time = self.written = self.stored = 0
+        self.time = self.written = 0
         self.newest_first = np.empty(0, np.int64)  # entries, from the last written on
         self.read = np.zeros(config.capacity, np.bool_)  # entries read since the last `write`
         self.neighbours: Neighbours | None = None
 
     def __len__(self) -> int:
-        return self.stored
+        return min(self.written, len(self.keys))
 
     def write(
         self, keys: np.ndarray, next_states: np.ndarray, rewards: np.ndarray, returns: np.ndarray
@@ -42,23 +42,11 @@ class EpisodicMemory(Stateful):
         keys, next_states: [N, key]; rewards, returns: [N]. Of more than `capacity` the last ones
         are stored. All that was read since the last `write` was used at the same time, before it.
         """
-        self.usage[self.read], self.read[:] = self.time + 1, False
         self.time += 2
-        kept = min(len(keys), self.config.capacity)
-        # Of equally used ones the first written goes: a long episode reads nearly every entry.
-        age = self.usage * 2**32 + self.number
-        oldest = np.argpartition(age, kept - 1)[:kept]
-        oldest = oldest[np.argsort(age[oldest])]
-        self.keys[oldest] = keys[-kept:]
-        self.values[oldest] = np.column_stack([next_states, rewards, returns])[-kept:]
-        self.usage[oldest] = self.time
-        self.number[oldest] = self.written + np.arange(1, kept + 1)
-        self.written += kept
-        self.stored = min(self.stored + kept, self.config.capacity)
-        stays = np.full(self.config.capacity, True)
-        stays[oldest] = False
-        before = self.newest_first
-        self.newest_first = np.concatenate([oldest[::-1], before[stays[before]]])
+        new, entries = (keys, next_states, rewards, returns), (self.keys, self.values)
+        when = self.usage, self.number, self.read, self.time, self.written
+        self.newest_first = write(new, entries, when, self.newest_first)
+        self.written += min(len(keys), len(self.keys))
         self.neighbours = None
 
     def build_index(self, mean: np.ndarray, std: np.ndarray) -> None:
@@ -67,27 +55,19 @@ class EpisodicMemory(Stateful):
         newest = np.take(self.keys, self.newest_first, axis=0)
         self.neighbours = Neighbours(newest, mean, std)
 
-    def search(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The k nearest entries to each state, float32 [N, key]; marks them as read.
+    def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Kernel-weighted mean of the k nearest entries' returns, and similarity of the nearest.
 
-        Returns squared distances, float32 [N, k] ascending, divided by the number of dimensions,
-        and the entries, int64 [N, k]. Raises `LookupError` if nothing is stored or indexed.
+        states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5), with d²
+        per dimension. Returns float32 [N] each; similarity, in (0, 1], is the kernel at the nearest
+        key over that at 0. Entries are marked as read; `LookupError` if none is stored or indexed.
         """
         if not self.neighbours:
             raise LookupError("the episodic memory is empty, or not indexed since it was written")
         count = min(self.config.neighbours, len(self.neighbours))
-        squared_distances, places = self.neighbours.nearest(states, count)
-        entries = self.newest_first[places]
-        self.read[entries] = True
-        return squared_distances / np.float32(states.shape[1]), entries
-
-    def recall(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Kernel-weighted mean of the k nearest entries' returns, and similarity of the nearest.
-
-        states: float32 [N, key]. The kernel is 1 / (d² + δ) (Pritzel et al. 2017, eq. 5). Returns
-        float32 [N] each; similarity, in (0, 1], is the kernel at the nearest key over that at 0.
-        """
-        return recollect(*self.search(states), self.values[:, -1], self.config.kernel_bandwidth)
+        found = self.neighbours.nearest(states, count)
+        entries = self.newest_first, self.values, self.read
+        return recollect(*found, *entries, states.shape[1], self.config.kernel_bandwidth)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `Stateful` says; `build_index` before the next look-up."""
@@ -97,17 +77,42 @@ class EpisodicMemory(Stateful):
 
 
 @kernel
-def recollect(
-    squared_distances: np.ndarray, indices: np.ndarray, returns: np.ndarray, bandwidth: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """`EpisodicMemory.recall` from what `search` returns, and all entries' returns, float32 [M]."""
+def write(new, entries, when, newest_first):
+    """`EpisodicMemory.write`, in its arrays; returns `newest_first` as it is then."""
+    (keys, next_states, rewards, returns), (usage, number, read, time, written) = new, when
+    for entry in range(len(usage)):
+        if read[entry]:
+            usage[entry], read[entry] = time - 1, False
+    # Of equally used ones the first written goes: a long episode reads nearly every entry.
+    age, order = usage * 2**32 + number, np.empty(len(usage), np.int64)
+    count = min(len(keys), len(usage))
+    for n in range(count):
+        entry, given = np.argmin(age), len(keys) - count + n
+        age[entry] = 2**62
+        key, value = entries[0][entry], entries[1][entry]
+        key[:], value[:-2] = keys[given], next_states[given]
+        value[-2], value[-1] = rewards[given], returns[given]
+        usage[entry], number[entry] = time, written + n + 1
+        order[count - 1 - n] = entry
+    for entry in newest_first:
+        if number[entry] <= written:
+            order[count] = entry
+            count += 1
+    return order[:count]
+
+
+@kernel
+def recollect(squared_distances, places, newest_first, values, read, size, bandwidth):
+    """`EpisodicMemory.recall` from what `Neighbours.nearest` found; marks entries in `read`."""
     recalled, similarity = np.empty((2, len(squared_distances)), np.float32)
     for n in range(len(squared_distances)):
         total = weighted = 0.0
         for i in range(squared_distances.shape[1]):
-            weight = 1 / (squared_distances[n, i] + bandwidth)
+            entry = newest_first[places[n, i]]
+            read[entry] = True
+            weight = 1 / (squared_distances[n, i] / np.float32(size) + bandwidth)
             total += weight
-            weighted += weight * returns[indices[n, i]]
+            weighted += weight * values[entry, -1]
         recalled[n] = weighted / total
-        similarity[n] = bandwidth / (squared_distances[n, 0] + bandwidth)
+        similarity[n] = bandwidth / (squared_distances[n, 0] / np.float32(size) + bandwidth)
     return recalled, similarity

@@ -48,27 +48,32 @@ def set_state(environment: Environment, state: dict[str, Any]) -> None:
 
 
 class LastEpisodes:
-    """The last episodes: the state before each, its actions, and a digest of its outcome.
+    """The last episodes, and the state before each; of those in a checkpoint actions and a digest.
 
     They are in two blocks. The global generators are saved before the first episode of a block.
     """
 
     def __init__(self) -> None:
         self.blocks: list[list[dict[str, Any]]] = [[]]
-        self.start: dict[str, Any] = {}
 
     def begin(self, environment: Environment) -> None:
         """Before an episode."""
         block = self.blocks[-1]
         if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
             self.blocks = [block, []]
-        self.start = state_of(environment, of_process=not self.blocks[-1])
+        self.blocks[-1].append({"start": state_of(environment, of_process=not self.blocks[-1])})
 
     def end(self, episode: Episode) -> None:
         """After an episode."""
-        actions = torch.from_numpy(episode.actions)
-        one = {"start": self.start, "actions": actions, "outcome": _digest(episode)}
-        self.blocks[-1].append(one)
+        self.blocks[-1][-1] |= {"actions": episode.actions, "outcome": episode}
+
+    def saved(self) -> list[list[dict[str, Any]]]:
+        """For a checkpoint."""
+        for one in itertools.chain.from_iterable(self.blocks):
+            if isinstance(episode := one["outcome"], Episode):
+                actions = torch.from_numpy(episode.actions)
+                one |= {"actions": actions, "outcome": _digest(episode)}
+        return self.blocks
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:

@@ -54,10 +54,7 @@ class Adam(Stateful):
 
         v̂ is the second moment. Before the first step it is not known: the direction is returned.
         """
-        if self.decayed[1] == 1:
-            return direction
-        unbiased = self.square / np.float32(1 - self.decayed[1])
-        return direction / (np.sqrt(unbiased) + np.float32(EPSILON))
+        return direction if self.decayed[1] == 1 else preconditioned(direction, self.state)
 
 
 @kernel
@@ -78,3 +75,12 @@ def step(gradient, state):
         square[i] = keep_square * square[i] + add_square * slope * slope
         parameters[i] -= rate * mean[i] / (math.sqrt(square[i]) * scale + np.float32(EPSILON))
     return norm
+
+
+@kernel
+def preconditioned(direction, state):
+    """See `Adam.preconditioned`."""
+    result, share = np.empty_like(direction), np.float32(1 - state.decayed[1])
+    for i in range(len(direction)):
+        result[i] = direction[i] / (math.sqrt(state.square[i] / share) + np.float32(EPSILON))
+    return result

@@ -44,9 +44,9 @@ def require_within(
     """Raise `NonFiniteError` unless all `values` are finite and in [0, `largest`] ± `rounding`."""
     require_finite(name, values)
     found = np.asarray(values)
-    outside = found[(found < -rounding) | (found > largest + rounding)].ravel()
-    if len(outside):
-        raise NonFiniteError(f"{name} is {outside[0]}, which is not in [0, {largest:g}]")
+    if found.min() < -rounding or found.max() > largest + rounding:
+        outside = found[(found < -rounding) | (found > largest + rounding)].ravel()[0]
+        raise NonFiniteError(f"{name} is {outside}, which is not in [0, {largest:g}]")
 
 
 @njit(cache=True)
