@@ -56,8 +56,14 @@ bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour
 	@$(call one_of,BENCH,quick)
 	@$(IN_VENV) benchmarks $(if $(BENCH),--quick)
 
-verify: setup ## repeat a sample of the nine short runs and compare to the bit (SAMPLE=3)
+verify: setup ## repeat a sample of the nine short runs and one of each kept world, and compare to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
+	folder=$$(mktemp -d)
+	trap 'rm -rf "$$folder"' EXIT
+	for world in reference/worlds/*/; do
+	    $(IN_VENV) tools.kept_runs unpack "$$world" "$$folder/$$(basename "$$world")" --sample 1 >/dev/null
+	done
+	$(IN_VENV) mace_rl.cli verify "$$folder" --trust # a rule for β is of extras/
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
 	@$(call one_of,CROSS,short)

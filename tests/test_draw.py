@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -122,6 +123,10 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
     row, _ = re.findall(r"\| C1 \|.*", page)  # robust, and by the paper's words
     assert row.count("reproduced; 2 of 2 shown") == 1 and row.count("; 0 of 2 shown") == 2
-    assert message(monkeypatch, worlds, str(tmp_path / "tuned")).startswith(
-        f"worlds: {tmp_path / 'tuned' / 'tuned' / 'metrics.csv'} is not there"
-    )
+    (tmp_path / "tuned/claims.json").unlink()  # as while Hopper's runs are not all there
+    shutil.rmtree(tmp_path / "plain")
+    worlds.make(tmp_path)
+    assert set(pd.read_csv(tmp_path / "worlds/verdicts.csv")["world"]) == {"published"}
+    assert set(pd.read_csv(tmp_path / "worlds/draws.csv")["world"]) == {"tuned", "published"}
+    said = message(monkeypatch, worlds, str(tmp_path / "tuned"))
+    assert said.startswith(f"worlds: {tmp_path / 'tuned'} has no tuned/metrics.csv")

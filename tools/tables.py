@@ -155,8 +155,8 @@ def main() -> None:
     for name in outputs:
         write_readme(name, studies[name], outputs[name])
         outputs[name] = [*outputs[name], README]
-    if outputs.keys() >= set(worlds.WORLDS):
-        outputs[worlds.FOLDER] = worlds.make(MADE)
+    if together := worlds.make(MADE):
+        outputs[worlds.FOLDER] = together
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
     print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")

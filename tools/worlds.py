@@ -2,8 +2,9 @@
 
     python -m tools.worlds FOLDER      for example results/worlds; `make tables` does it, too
 
-FOLDER/WORLD has the metrics.csv, claims.json and figure1.csv of each of `WORLDS`. Into
-FOLDER/worlds come the verdicts of all, the paper's Table 1 as a draw, and their pictures.
+FOLDER/WORLD has the metrics.csv and figure1.csv of each of `WORLDS` that is there, and its
+claims.json once all its environments are. Into FOLDER/worlds come the verdicts of these, the
+paper's Table 1 as a draw, and their pictures.
 """
 
 import argparse
@@ -25,37 +26,38 @@ from mace_rl.study.show.sections import Section
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
 CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
 WAYS = {"robust": "verdicts", "by the paper's words and code": "verdicts_by_words"}
-ORIGIN = (
-    f"From {', '.join(f'[{world}](../{world})' for world in WORLDS)}, by `python -m tools.worlds`."
-)
+COMMAND = "`python -m tools.worlds`"
 
 
 def make(folder: Path) -> list[str]:
-    """Make FOLDER/worlds; returns what it then has."""
+    """Make FOLDER/worlds; returns what it then has, nothing if there is no world."""
     study = read_study([CONFIG])
-    claims = read_claims(study, CONFIG.parent / study.claims)
+    table1 = read_claims(study, CONFIG.parent / study.claims).table1
     look = plot_style(study.metrics, study.figure.model_dump(), study.labels, study.colours)
-    runs = {world: pd.read_csv(folder / world / "metrics.csv") for world in WORLDS}
-    answers = {world: read_ledger(folder / world / "claims.json") for world in WORLDS}
-    curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in WORLDS}
+    there = [world for world in WORLDS if (folder / world / "metrics.csv").exists()]
+    if not there:
+        return []
+    runs = {world: pd.read_csv(folder / world / "metrics.csv") for world in there}
+    curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in there}
+    ledgers = {world: folder / world / "claims.json" for world in there}
+    answers = {world: read_ledger(path) for world, path in ledgers.items() if path.exists()}
+    tables, pictures = {}, {}
+    if answers:
+        tables = {name: worlds.verdicts(answers, way) for way, name in WAYS.items()}
+        pictures["verdicts"] = worlds.draw_verdicts(tables["verdicts"])
+    places = [numbers(own, table1).assign(world=world) for world, own in runs.items()]
+    draws = [draw(own, table1)._asdict() | {"world": world} for world, own in runs.items()]
+    tables |= {"numbers": pd.concat(places), "draws": pd.DataFrame(draws)}
+    pictures["numbers"] = worlds.draw_numbers(runs, table1, look)
+    pictures["curves"] = worlds.draw_curves(curves, quantity("1", study.metrics), look)
     goal = folder / FOLDER
     goal.mkdir(exist_ok=True)
-    tables = {name: worlds.verdicts(answers, way) for way, name in WAYS.items()}
-    tables["numbers"] = pd.concat(
-        [numbers(own, claims.table1).assign(world=world) for world, own in runs.items()]
-    )
-    draws = [draw(own, claims.table1)._asdict() | {"world": world} for world, own in runs.items()]
-    tables["draws"] = pd.DataFrame(draws)
-    pictures = {
-        "verdicts": worlds.draw_verdicts(tables["verdicts"]),
-        "numbers": worlds.draw_numbers(runs, claims.table1, look),
-        "curves": worlds.draw_curves(curves, quantity("1", study.metrics), look),
-    }
     for name, table in tables.items():
         table.to_csv(goal / f"{name}.csv", index=False)
     for name, picture in pictures.items():
         save_figure(picture, goal / f"{name}.png")
-    text = page("worlds", ORIGIN, _sections(tables, look), list(pictures))
+    origin = f"From {', '.join(f'[{world}](../{world})' for world in there)}, by {COMMAND}."
+    text = page("worlds", origin, _sections(tables, look), list(pictures))
     (goal / "README.md").write_text(text, encoding="utf-8")
     return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
 
@@ -69,12 +71,12 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     """The tables in words, for README.md."""
     said = "{verdict}; {shown} of {parts} shown; room {least_room:.2g} to {most_room:.2g}"
     sections = []
-    for way, name in WAYS.items():
+    for way, name in WAYS.items() if "verdicts" in tables else ():
         rows: Any = tables[name].to_dict("records")
         long = tables[name].assign(said=[said.format(**row) for row in rows])
         wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
         order = long[["claim", "statement"]].drop_duplicates()
-        frame = order.merge(wide[list(WORLDS)].reset_index()).fillna("")
+        frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")
         sections.append(Section(f"Verdicts: {way}", "Room: of its parts, in margins.", frame))
     table = tables["numbers"]
     cells = table.assign(
@@ -90,7 +92,8 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     )
     wide = cells.pivot(index=["number", "paper"], columns="world", values="seeds")
     order = cells[["number", "paper"]].drop_duplicates()
-    frame = order.merge(wide[list(WORLDS)].reset_index()).astype({"paper": int}).map(str)
+    wide = wide[table["world"].unique()].reset_index().fillna("")
+    frame = order.merge(wide).astype({"paper": int}).map(str)
     note = (
         "Median and central 90 % of each world's seeds. *: the paper's number is not among these."
     )
@@ -124,10 +127,9 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, help="where the worlds' folders are")
     folder = parser.parse_args().folder
-    try:
-        print(*(folder / FOLDER / name for name in make(folder)), sep="\n")
-    except FileNotFoundError as error:
-        sys.exit(f"worlds: {error.filename} is not there: Snakemake makes it of each world")
+    if not (made := make(folder)):
+        sys.exit(f"worlds: {folder} has no {WORLDS[0]}/metrics.csv, nor that of another world")
+    print(*(folder / FOLDER / name for name in made), sep="\n")
 
 
 if __name__ == "__main__":
