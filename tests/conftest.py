@@ -19,11 +19,10 @@ import mace_rl.pins  # noqa: F401  isort: skip  (pins NumPy before it is importe
 import gymnasium
 import pytest
 
-from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check
 from mace_rl.environments import registered
-from mace_rl.study.config import Study, read_study
+from mace_rl.study.config import Study, merge_layers, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 

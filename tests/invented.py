@@ -13,7 +13,8 @@ from mace_rl.study.claims_config import parts_of, read_claims
 from mace_rl.study.compare.aggregate import SCORED
 from mace_rl.study.compare.ledger import Finding
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import CORRELATION, Metric, metrics_columns
+from mace_rl.study.measure.betas import CORRELATION
+from mace_rl.study.measure.metrics import LearningCurve, Metric, final_return, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 
 SETTINGS = {"final_fraction": 0.1, "threshold": 0.75, "moving_average": 50, "comparisons": []}
@@ -55,6 +56,19 @@ def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:
     """The records of a run with these returns, every episode of this length."""
     episodes = np.arange(1, len(returns) + 1)
     return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
+
+
+def curve(returns, final=None, random=-1e9, goals=(), **settings):
+    """What a metric gets; settings that are not given are those of `CONFIG`."""
+    returns, changed = np.asarray(returns, float), CONFIG.model_copy(update=settings)
+    final = final_return(returns, 0.1) if final is None else final
+    return LearningCurve(returns, final, random, changed, *goals)
+
+
+def averages(returns, window):
+    """Moving averages by episode number (from 1), from pandas."""
+    rolling = pd.Series(returns).rolling(window).mean()
+    return {t + 1: value for t, value in enumerate(rolling) if not np.isnan(value)}
 
 
 def table_for_tables(

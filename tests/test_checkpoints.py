@@ -16,9 +16,9 @@ from gymnasium.spaces import Box, Discrete
 from shared import RESULTS, Killed, content_of, provenance_of
 
 from mace_rl import sources
-from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
 from mace_rl.runs import checkpoint, provenance, run
+from mace_rl.study.config import merge_layers
 from mace_rl.trainer import Trainer
 
 

@@ -30,7 +30,7 @@ from mace_rl.study.claims_config import ClaimsConfig, parts_of, read_claims
 from mace_rl.study.compare import direction_and_size, verdicts
 from mace_rl.study.compare.ledger import Finding, SizedFinding, read_ledger, to_json
 from mace_rl.study.config import Study
-from mace_rl.study.measure.metrics import CORRELATION
+from mace_rl.study.measure.betas import CORRELATION
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}

@@ -13,7 +13,7 @@ from shared import ROOT, VARIANTS, finish, provenance_of
 from mace_rl.records import EpisodeRecord, RunKey, as_columns
 from mace_rl.study.compare.summary import split, summary
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.measure.metrics import metrics_table
 from mace_rl.study.show import curves
 from mace_rl.study.show.latex import table1_latex
 

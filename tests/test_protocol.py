@@ -13,7 +13,7 @@ from mace_rl import files
 from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import CORRELATION
+from mace_rl.study.measure.betas import CORRELATION
 from tools import kept_runs
 
 CONFIRMATION = ROOT / "reference" / "confirmation"

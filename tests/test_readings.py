@@ -8,8 +8,7 @@ from invented import CLAIMS
 from mace_rl.study.compare import readings as r
 from mace_rl.study.compare.statistics import logrank
 from mace_rl.study.config import Study
-from mace_rl.study.measure.metrics import all_metrics
-from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.measure.metrics import all_metrics, metrics_table
 from mace_rl.study.show import tables
 from mace_rl.study.show.curves import PlotStyle
 from mace_rl.study.show.markdown import markdown

@@ -23,7 +23,8 @@ from mace_rl.study.compare.estimates import LEVEL, Pair, find, pairs_of
 from mace_rl.study.compare.ledger import SizedFinding
 from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import BEFORE, CORRELATION, CORRELATIONS, METRICS
+from mace_rl.study.measure.betas import BEFORE, CORRELATION, CORRELATIONS
+from mace_rl.study.measure.metrics import METRICS
 
 SETTINGS = read_study([Path("config.yaml"), Path("config/study.yaml")]).metrics
 SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 1000})  # for the time
