@@ -36,7 +36,8 @@ by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be as
 BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
-QUESTIONED = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})
+FEW = {"bootstrap_repetitions": 1000}
+QUESTIONED, QUICK = (metrics.model_copy(update=FEW) for metrics in (QUESTIONED, STUDY.metrics))
 
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
 LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
@@ -50,6 +51,21 @@ def noisy(seed: int, episodes: int = 400) -> np.ndarray:
     generator = np.random.default_rng(seed)
     level = 100 / (1 + np.exp(-(np.arange(episodes) - generator.integers(50, 300)) / 20))
     return np.round(level + generator.normal(size=episodes) * 10)
+
+
+def episode_columns(episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Those of episodes.csv, of random doubles."""
+    draws = np.random.default_rng(seed)
+    length = draws.integers(1, 500, episodes)
+    return {
+        "episode": np.arange(1, episodes + 1),
+        "env_steps": np.cumsum(length),
+        "length": length,
+        "extrinsic_return": draws.normal(size=episodes) * 10.0 ** draws.integers(-20, 20, episodes),
+        "intrinsic_return": draws.exponential(size=episodes),
+        "beta": draws.random(episodes) ** 20,
+        "terminated": draws.integers(0, 2, episodes),
+    }
 
 
 def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:

@@ -1,25 +1,21 @@
 """β by schedule and by meta-adaptation: each against a computation of its own."""
 
-import copy
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from shared import environment_of, finish
+from shared import ROOT, environment_of, finish
 
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.config.section import ConfigError
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
 from mace_rl.study.config import read_study
 
-ROOT = Path(__file__).parents[1]
 SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
 
 
@@ -52,24 +48,6 @@ def test_schedules_by_hand(run_config, beta, expected):
         betas.append(rule.beta)
         rule.next_episode(None, None)  # whatever it was
     assert betas == pytest.approx(expected) and not rule.learns
-
-
-@pytest.mark.parametrize(
-    ("beta", "message"),
-    [
-        (
-            {"kind": "constant", "value": 10.5},
-            "beta.value is 10.5, but .* less than or equal to 10",
-        ),
-        ({"kind": "constant"}, "the key 'beta.value' is missing"),
-        (SCHEDULE | {"floor": 0.5}, "beta .* floor is 0.5, which must not exceed initial, 0.4"),
-        (SCHEDULE | {"flor": 0.1}, "unknown key 'beta.flor' .* 'floor'"),
-    ],
-)
-def test_wrong_settings_get_one_line(run_config, beta, message):
-    with pytest.raises(ConfigError, match=message) as caught:
-        run_config("CartPole-v1", "mace_fixed", beta=beta)
-    assert "\n" not in str(caught.value)
 
 
 # --- What the LSTM reads ------------------------------------------------------------------------
@@ -157,19 +135,6 @@ def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(m
     searching, advancing = np.split(np.array(betas), 2)
     assert searching[50:300].min() > 0.7 and advancing[50:300].min() > 0.7
     assert advancing[600:].max() < 0.3
-
-
-def test_restored_it_continues_to_the_bit(make):
-    one, other, rng = make(50, horizon=3), make(50, horizon=3), np.random.default_rng(0)
-    for n in range(50):
-        if n == 20:
-            other.load_state_dict(copy.deepcopy(one.state_dict()))
-        vectors = rng.standard_normal((2, 9)).astype(np.float32)
-        for meta in (one, other)[: 1 + (n >= 20)]:
-            meta.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
-            meta.learn(vectors[0], 0.5, Effect(vectors[1], 0.5))
-        assert n < 20 or one.beta == other.beta
-    assert one.integrator.logit == other.integrator.logit and one.integrator.count == 47
 
 
 # --- Credit -------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from invented import (
     PAPERS,
     QUESTIONED,
     QUESTIONS,
+    QUICK,
     ROBUST,
     ROOT,
     STUDY,
@@ -70,12 +71,9 @@ def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
         (2, 12, SMALL, 0.3, BUT_C6, "open"),
     ],
 )
-def test_verdicts_where_the_truth_is_known(
-    study, rule, seeds, advantage, noise, which, expected
-) -> None:
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+def test_verdicts_where_the_truth_is_known(rule, seeds, advantage, noise, which, expected) -> None:
     claims = {1: PAPERS, 2: BY_SIZE}[rule]
-    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), settings, claims)
+    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), QUICK, claims)
     found = {one.claim: {judged.verdict for judged in one.ways.values()} for one in answers}
     assert {name: found[name] for name in which} == {name: {expected} for name in which}
 
@@ -116,9 +114,8 @@ def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
         assert verdicts.verdict(found) == expected
 
 
-def test_all_parts_are_corrected_together_and_have_their_margins(study: Study) -> None:
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), settings, PAPERS)
+def test_all_parts_are_corrected_together_and_have_their_margins() -> None:
+    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), QUICK, PAPERS)
     for how in (LITERAL, ROBUST):
         parts = [part for answer in answers for part in answer.ways[how].parts]
         # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
@@ -134,8 +131,7 @@ def test_all_parts_are_corrected_together_and_have_their_margins(study: Study) -
         margins = {(part.metric, *part.environments): part.worth_mentioning for part in parts}
         for environment in EPISODES:
             assert margins[CORRELATION, environment] == 0.05
-            reference = study.metrics.reference_return[environment]
-            span = reference - study.metrics.random_return_in(environment)
+            span = QUICK.reference_return[environment] - QUICK.random_return_in(environment)
             assert margins["final_return", environment] == pytest.approx(span / 20)
         assert [margins[key] for key in margins if len(key) == 4] == [0.05]  # over all
 
@@ -187,15 +183,14 @@ def test_variants_of_different_budgets_are_compared_within_the_shorter(study: St
 
 def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds() -> None:
     """Q7: three tasks, of which one has more seeds."""
-    settings = QUESTIONED
     frame = table_for_questions(30, mace_full=0.3)
     frame = frame[(frame["env"] == "BarrenRegion-v0") | (frame["seed"] < 12)]
-    found = verdicts.ledger(frame, settings, QUESTIONS)
+    found = verdicts.ledger(frame, QUESTIONED, QUESTIONS)
     (part,) = next(one for one in found if one.claim == "Q7").ways[ROBUST].parts
     areas = frame.set_index(["env", "variant", "seed"])["area_under_curve"].sort_index()
     expected = [
         (areas[env, "mace_full"] - areas[env, "mace_no_memory"]).mean()
-        / (settings.reference_return[env] - settings.random_return[env])
+        / (QUESTIONED.reference_return[env] - QUESTIONED.random_return[env])
         for env in ("BarrenRegion-v0", "NoisyMountainCar-v0", "NoisyDeepSea10-v0")
     ]
     assert part.difference == pytest.approx(np.mean(expected))
@@ -242,27 +237,25 @@ def test_a_part_has_direction_and_size(interval, p_holm, p_equivalent_holm, expe
     assert (found.outcome, found.size, found.replication) == (*expected, "")
 
 
-def test_what_could_not_improve_could_not_be_asked(study: Study) -> None:
+def test_what_could_not_improve_could_not_be_asked() -> None:
     """Acrobot's PPO needs 60 episodes of a possible 50, and ends where the best run does."""
     frame = table_for_claims(12, EQUAL, noise=0.02)
     draws, acrobot = np.random.default_rng(5), frame["env"] == "Acrobot-v1"
     frame.loc[acrobot, "sample_efficiency_common"] = draws.integers(58, 63, acrobot.sum())
     frame.loc[acrobot, "final_return"] = draws.normal(-86, 1, acrobot.sum())
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = verdicts.ledger(frame, settings, BY_SIZE)
+    answers = verdicts.ledger(frame, QUICK, BY_SIZE)
     judged = {one.claim: one.ways[ROBUST] for one in answers}
     assert (judged["C1"].outcome, judged["C1"].verdict) == ("no_room", "could not be asked")
     assert [part.outcome for part in judged["C7"].parts] == ["no_room"] * 2 + ["absent"] * 2
     assert judged["C7"].verdict == "not reproduced"  # for Hopper's sake
     frame.loc[~acrobot, "final_return"] = draws.normal(900, 900, (~acrobot).sum())
-    judged = {one.claim: one for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    judged = {one.claim: one for one in verdicts.ledger(frame, QUICK, BY_SIZE)}
     assert judged["C7"].ways[ROBUST].verdict == "open"
 
 
-def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> None:
+def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = {one.claim: one.ways for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    answers = {one.claim: one.ways for one in verdicts.ledger(frame, QUICK, BY_SIZE)}
     runs = frame.set_index(["env", "variant", "seed"]).sort_index()
     efficiency = runs.loc["Acrobot-v1", "sample_efficiency_common"]
     (part, _), mean = answers["C1"][ROBUST].parts, efficiency["ppo"].mean()
@@ -322,10 +315,9 @@ def test_what_a_study_lacks_for_a_family() -> None:
     for title, family in CLAIMS.families.items():
         parts = [part for _, part in parts_of(family)]
         names = {name for part in parts for name in (*part.environments, part.variant, *part.over)}
-        settings = QUESTIONED
-        assert CLAIMS.lacking(names, names, settings)[title] == []
+        assert CLAIMS.lacking(names, names, QUESTIONED)[title] == []
         for name in names:
-            assert CLAIMS.lacking(names - {name}, names - {name}, settings)[title] == [name]
-        bare = settings.model_copy(update={"reference_return": {}})
+            assert CLAIMS.lacking(names - {name}, names - {name}, QUESTIONED)[title] == [name]
+        bare = QUESTIONED.model_copy(update={"reference_return": {}})
         (first, *_) = CLAIMS.lacking(names, names, bare)[title]
         assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))

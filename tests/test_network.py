@@ -86,17 +86,6 @@ def test_parameters_in_another_precision_are_refused():
         compiled.move_to(np.zeros(len(compiled.parameters)))
 
 
-@pytest.mark.parametrize("hidden", [[1], [5, 17], [64, 64]])
-def test_the_forward_pass_of_one_observation_is_that_of_many_to_the_bit(hidden):
-    rng = np.random.default_rng(0)
-    one = CompiledMLP(mlp([6, *hidden, 3], 1.0, rng))
-    inputs = drawn(rng, (70, 6))
-    together = one.forward(inputs).outputs
-    assert len(np.unique(together)) > 200
-    for row, outputs in zip(inputs, together, strict=True):
-        assert (one.forward(row[None]).outputs[0] == outputs).all()
-
-
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
 @pytest.mark.parametrize("output_gain", [0.01, 1.0])
 def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):

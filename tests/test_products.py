@@ -187,6 +187,23 @@ def test_the_nearest_are_found_and_equals_in_order(seed, count_of_queries, total
     assert np.array_equal(np.concatenate([distances for distances, _ in single]), squared_distances)
 
 
+@pytest.mark.parametrize(("size", "total"), [(1, 30), (4, 500), (15, 2000)])
+@pytest.mark.parametrize("centre", [0, 1000])
+def test_the_mean_goes_before_the_scale(size, total, centre):
+    """Far from the origin, too, at positions like 1000 ± 0.01. NaN is at no distance from any."""
+    rng, spread = np.random.default_rng(0), np.array([0.01, 2, 1] * 5)[:size]
+    points = (centre + spread * rng.standard_normal((total + 25, size))).astype(np.float32)
+    points, queries = points[25:], np.append(points[:25], [[nan] * size], axis=0)
+    mean, std = points.mean(0, dtype=np.float64), points.std(0, dtype=np.float64)
+    squares, indices = Neighbours(points, mean, std).nearest(queries.astype(np.float32), 20)
+    assert np.isnan(squares[25]).all() and ((indices >= 0) & (indices < total)).all()
+    exact = (((queries[:25, None].astype(np.float64) - points[None]) / std) ** 2).sum(2)
+    np.testing.assert_allclose(squares[:25], np.sort(exact, axis=1)[:, :20], rtol=1e-4, atol=1e-7)
+    of_found = np.take_along_axis(exact, indices[:25], axis=1)
+    np.testing.assert_allclose(of_found, squares[:25], rtol=1e-4, atol=1e-7)
+    assert all(len(set(row)) == 20 for row in indices.tolist())
+
+
 def test_what_comes_after_the_candidates_were_cut_down_still_counts():
     """Three blocks have more points than are asked for; the fourth has one just within reach."""
     draw = np.random.default_rng(0)
