@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
-from shared import Bonanza, Twin, finish
+from shared import NETWORKS, SOON, Bonanza, Twin, finish
 
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.refusal import Refusal
 from mace_rl.trainer import Trainer
-
-NETWORKS = ["actor", "extrinsic", "intrinsic"]
-SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 
 
 @pytest.mark.parametrize(

@@ -20,12 +20,9 @@ SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
 
 
 def episode_of(extrinsic_return: float) -> Episode:
-    """Of eight steps."""
     rewards = np.r_[np.zeros(7), extrinsic_return]
     return Episode(np.zeros((9, 1)), np.zeros(8, int), np.zeros(8), rewards, True)
 
-
-# --- Schedules ----------------------------------------------------------------------------------
 
 PAPER_S = 0.999 ** np.arange(5000)
 
@@ -50,9 +47,6 @@ def test_schedules_by_hand(run_config, beta, expected):
     assert betas == pytest.approx(expected) and not rule.learns
 
 
-# --- What the LSTM reads ------------------------------------------------------------------------
-
-
 def test_features_by_hand():
     """Two episodes a window; returns 0 and 1, bonus 1, then a tenth of it a step."""
     gauge = Gauge(200)
@@ -71,9 +65,6 @@ def test_windows_of_any_budget(budget, windows):
         gauge.update(1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3)
     assert len(gauge.windows) == windows and np.abs(gauge.sequence()).max() <= 4
     assert gauge.windows[-1][0] == pytest.approx(1)
-
-
-# --- Meta-adaptation ----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -135,9 +126,6 @@ def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(m
     searching, advancing = np.split(np.array(betas), 2)
     assert searching[50:300].min() > 0.7 and advancing[50:300].min() > 0.7
     assert advancing[600:].max() < 0.3
-
-
-# --- Credit -------------------------------------------------------------------------------------
 
 
 def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(make):

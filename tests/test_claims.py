@@ -30,7 +30,6 @@ from mace_rl.records import RecordError
 from mace_rl.study.claims_config import ClaimsConfig, parts_of, read_claims
 from mace_rl.study.compare import direction_and_size, verdicts
 from mace_rl.study.compare.ledger import Finding, SizedFinding, read_ledger, to_json
-from mace_rl.study.config import Study
 from mace_rl.study.measure.betas import CORRELATION
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
@@ -43,9 +42,13 @@ SLIGHT = {"ppo": 0.0, "mace_fixed": 0.01, "mace_full": 0.03}
 BUT_C6 = [f"C{number}" for number in range(1, 11) if number != 6]  # which says that fixed is first
 OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
 
+# Of a `Finding`: what it is of, and what is between its interval and its corrected p values.
+FOUND = ("CartPole-v1",), "final_return", "mace_full", "ppo", "return"
+FIT = 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001
 
-def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
-    answers = verdicts.ledger(frame, study.metrics, PAPERS)
+
+def found_of(frame: pd.DataFrame, claim: str) -> list[Finding]:
+    answers = verdicts.ledger(frame, STUDY.metrics, PAPERS)
     (answer,) = (one for one in answers if one.claim == claim)
     return answer.ways[ROBUST].parts
 
@@ -92,11 +95,7 @@ def test_verdicts_where_the_truth_is_known(rule, seeds, advantage, noise, which,
 )
 def test_a_part_by_the_written_rule(seeds, difference, p_holm, p_equivalent_holm, expected) -> None:
     """The p values that are not corrected say nothing."""
-    finding = Finding(
-        *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", seeds, difference),
-        *(-99.0, 99.0, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001),
-        *(p_holm, p_equivalent_holm),
-    )
+    finding = Finding(*FOUND, seeds, difference, -99.0, 99.0, *FIT, p_holm, p_equivalent_holm)
     assert (finding.p_value, finding.p_equivalent) == (0.0001, 0.0001)
     assert verdicts.outcome(finding) == expected
 
@@ -136,9 +135,9 @@ def test_all_parts_are_corrected_together_and_have_their_margins() -> None:
         assert [margins[key] for key in margins if len(key) == 4] == [0.05]  # over all
 
 
-def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
+def test_a_part_is_what_paired_statistics_say() -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    part = found_of(frame, study, "C1")[0]
+    part = found_of(frame, "C1")[0]
     assert (part.variant, part.baseline) == ("mace_full", "ppo")
     runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])
     times = runs["sample_efficiency_common"]
@@ -151,32 +150,32 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     u = scipy.stats.mannwhitneyu(times["ppo"], times["mace_full"]).statistic
     assert part.probability == pytest.approx(u / 144)
     # Verdicts are of 95 % intervals, whatever those of the tables have.
-    wide = study.metrics.model_copy(update={"confidence": 0.5})
+    wide = STUDY.metrics.model_copy(update={"confidence": 0.5})
     assert verdicts.ledger(frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
 
 
-def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
+def test_a_seed_that_one_variant_lacks_is_an_error() -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     own = (frame["env"] == "CartPole-v1") & (frame["variant"] == "ppo") & (frame["seed"] == 5)
     with pytest.raises(RecordError, match=r"CartPole-v1, ppo, seed 5: there is no"):
-        verdicts.ledger(frame[~own], study.metrics, PAPERS)
+        verdicts.ledger(frame[~own], STUDY.metrics, PAPERS)
 
 
-def test_a_part_without_a_test_counts_where_all_are_corrected(study: Study) -> None:
+def test_a_part_without_a_test_counts_where_all_are_corrected() -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     one_seed = frame[(frame["env"] != "HopperBulletEnv-v0") | (frame["seed"] == 0)]
     # By 2 of 2¹² sign patterns, as in most others; of 24 only C8's two parts have smaller p values.
-    found = [part.p_holm for part in found_of(one_seed, study, "C1")]
+    found = [part.p_holm for part in found_of(one_seed, "C1")]
     assert found == pytest.approx([22 * 2 / 2**12] * 2)
 
 
-def test_variants_of_different_budgets_are_compared_within_the_shorter(study: Study) -> None:
+def test_variants_of_different_budgets_are_compared_within_the_shorter() -> None:
     """What neither reaches is no difference, and what a third variant has does not matter."""
     frame = table_for_claims(12, EQUAL, noise=0.0)
     for variant, budget in (("ppo", 4000), ("mace_full", 2000), ("mace_fixed", 500)):
         own = (frame["env"] == "CartPole-v1") & (frame["variant"] == variant)
         frame.loc[own, ["episodes", "sample_efficiency_common"]] = budget  # never reached
-    over_ppo, over_fixed = found_of(frame, study, "C5")
+    over_ppo, over_fixed = found_of(frame, "C5")
     assert (over_ppo.difference, over_ppo.probability) == (0, 0.5)
     assert (over_ppo.worth_mentioning, over_fixed.worth_mentioning) == (100, 25)
 
@@ -228,11 +227,8 @@ def test_the_ledger_is_read_as_it_was_written(tmp_path: Path, claims: ClaimsConf
 )
 def test_a_part_has_direction_and_size(interval, p_holm, p_equivalent_holm, expected, changes):
     """The margin is 5, and p values that are not corrected say nothing."""
-    finding = SizedFinding(
-        *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", 10, np.mean(interval)),
-        *(*interval, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001, p_holm, p_equivalent_holm),
-        room=99.0,
-    )
+    given = 10, np.mean(interval), *interval, *FIT, p_holm, p_equivalent_holm
+    finding = SizedFinding(*FOUND, *given, room=99.0)
     found = direction_and_size.decided(replace(finding, **changes))
     assert (found.outcome, found.size, found.replication) == (*expected, "")
 

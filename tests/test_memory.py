@@ -25,9 +25,6 @@ def experiences(count, seed=0, key_size=3) -> list[np.ndarray]:
     return [rng.standard_normal(shape).astype(np.float32) for shape in shapes]
 
 
-# --- Recalling ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("stored", [1, 3, 40])
 def test_recalling_equals_a_loop_over_all_entries(stored):
     """Pritzel et al. 2017, eqs. 2 and 5, one query at a time in double precision."""
@@ -66,9 +63,6 @@ def test_what_cannot_be_recalled():
         memory.recall(state)
     memory.build_index(ORIGIN, UNIT)
     assert np.isnan(memory.recall(state + np.float32(1e25))[0]).all()
-
-
-# --- Replacement --------------------------------------------------------------------------------
 
 
 class ListOfSlots:

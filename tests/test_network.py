@@ -18,8 +18,6 @@ from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 
-# --- Compiled networks --------------------------------------------------------------------------
-
 # Compiled form, torch module from a generator, shape of the inputs.
 CASES = []
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
@@ -99,9 +97,6 @@ def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
         assert (layer.bias == 0).all()
 
 
-# --- The meta network ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("length", [1, 40])
 @pytest.mark.parametrize("units", [1, 5, None])
 def test_meta_network_is_pytorch_s_lstm_with_a_readout(units, length):
@@ -139,9 +134,6 @@ def test_a_permutation_is_uniform_if_the_draws_are():
     assert found.tolist() == sorted(map(list, permutations(range(4))))
     assert (counts == 12**3 / 24).all()
     assert (shuffled(np.ones((2, 5))) == np.arange(5)).all()
-
-
-# --- Any torch module ---------------------------------------------------------------------------
 
 
 class Normalised(torch.nn.Sequential):
