@@ -20,9 +20,8 @@ import gymnasium
 import pytest
 
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check
 from mace_rl.environments import registered
-from mace_rl.study.config import Study, merge_layers, read_study
+from mace_rl.study.config import Study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 
@@ -56,8 +55,7 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
     """
 
     def make(environment="CartPole-v1", variant="ppo", seed=0, **changes: Any) -> RunConfig:
-        settings = study.run_config(environment, variant, seed).settings()
-        return check(RunConfig, merge_layers(settings, changes), "the test")
+        return study.run_config(environment, variant, seed, changes)
 
     return make
 

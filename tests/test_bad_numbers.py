@@ -45,14 +45,11 @@ def moved(unit: float, offset: float, reward: float = 0.0) -> gymnasium.Env:
     return TransformObservation(env, lambda x: x * [unit, 1.0] + [offset, 0.0], space)
 
 
-LOST = "differences in observation[0]"
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        *(((unit, offset), LOST) for unit, offset in ((1e-9, 0), (1, 1e8), (1, 1e7))),
-        *(((unit, offset), "") for unit, offset in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
+        *((given, "differences in observation[0]") for given in ((1e-9, 0), (1, 1e8), (1, 1e7))),
+        *((given, "") for given in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
         ((1, 0, 1e11), "the rewards of episode 4"),
     ],
 )

@@ -16,14 +16,13 @@ from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
 from mace_rl.study.config import read_study
 
-SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
-
 
 def episode_of(extrinsic_return: float) -> Episode:
     rewards = np.r_[np.zeros(7), extrinsic_return]
     return Episode(np.zeros((9, 1)), np.zeros(8, int), np.zeros(8), rewards, True)
 
 
+HALVED = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
 PAPER_S = 0.999 ** np.arange(5000)
 
 
@@ -31,7 +30,7 @@ PAPER_S = 0.999 ** np.arange(5000)
     ("beta", "expected"),
     [
         ({"kind": "constant", "value": 0.3}, [0.3] * 3),
-        (SCHEDULE, [0.4, 0.2, 0.1, 0.06, 0.06]),
+        (HALVED, [0.4, 0.2, 0.1, 0.06, 0.06]),
         ({"variant": "mace_fixed"}, np.maximum(0.4 * PAPER_S, 0.01)),
         ({"variant": "mace_fixed_0.2"}, np.maximum(0.2 * PAPER_S, 0.01)),
         ({"variant": "mace_fixed_0.6"}, np.maximum(0.6 * PAPER_S, 0.01)),
