@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,10 +11,10 @@ import pytest
 from invented import LITERAL, ROBUST, ROOT
 
 from mace_rl import files
-from mace_rl.study.claims_config import parse_claims
+from mace_rl.study.claims_config import parse_claims, read_claims
 from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
-from mace_rl.study.config import read_study
-from mace_rl.study.measure.betas import CORRELATION
+from mace_rl.study.config import Study, read_study
+from mace_rl.study.measure.betas import BEFORE, CORRELATION
 from tools import kept_runs
 
 CONFIRMATION = ROOT / "reference" / "confirmation"
@@ -70,25 +71,112 @@ def test_configurations_have_the_runs_that_the_page_has() -> None:
 
 @pytest.mark.slow
 def test_every_run_is_kept_and_came_after_the_page_and_from_one_state_of_the_code() -> None:
-    git, told = ["git", "-C", str(ROOT)], {"capture_output": True, "text": True}
-    shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
-    if shallow.stdout.strip() != "false":
-        pytest.skip("not a git repository with its whole history")
-    records = {
-        tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
-        for archive in sorted((ROOT / "reference" / "study").glob("*/*.tar.xz"))
-        for name, content in kept_runs.read(archive).items()
-        if name.endswith(files.RECORD) and (record := json.loads(content))
-    }
-    records = {run: record for run, record in records.items() if run[2] in range(100, 200)}
+    records = kept(ROOT / "reference" / "study", range(100, 200))
     assert records.keys() == {
         run
         for name in ("study", "questions")
         for run in read_study([ROOT / "config.yaml", CONFIRMATION / f"{name}.yaml"]).runs()
     }
+    come_after(PAGE, records)
+
+
+# --- the three worlds -----------------------------------------------------------------------------
+
+WORLDS_PAGE = ROOT / "docs" / "worlds-protocol.md"
+WORLDS_TEXT = " ".join(WORLDS_PAGE.read_text(encoding="utf-8").split())
+WORLDS = {  # what is read over config.yaml
+    "tuned": ["worlds/tuned"],
+    "plain": ["plain", "worlds/plain"],
+    "published": ["published", "worlds/published"],
+    "questions": ["questions", "worlds/questions"],
+    "controls": ["questions", "controls", "worlds/controls"],
+}
+
+
+def world(name: str) -> Study:
+    paths = [ROOT / "config" / f"{path}.yaml" for path in WORLDS[name]]
+    return read_study([ROOT / "config.yaml", *paths])
+
+
+def test_the_worlds_have_the_runs_that_their_page_has() -> None:
+    runs = {name: set(world(name).runs()) for name in WORLDS}
+    tasks = runs["questions"] | runs["controls"]
+    shared = len(runs["questions"] & runs["controls"])
+    counts = [*(len(runs[name]) for name in ("tuned", "plain", "published")), len(tasks)]
+    said = f"{', '.join(map(str, counts[:-1]))} and {counts[-1]} runs: the last two rows share"
+    assert f"{said} {shared}." in WORLDS_TEXT
+    for name in WORLDS:
+        (row,) = re.findall(
+            rf"\| `config/worlds/{name}.yaml` \|(.*?)\| (\d+) to (\d+) \|", WORLDS_TEXT
+        )
+        seeds = {seed for _, _, seed in runs[name]}
+        assert seeds == set(range(int(row[1]), int(row[2]) + 1)) <= set(range(200, 300))
+        environments = {env.partition("-")[0] for env, _, _ in runs[name]}
+        named = row[0] + (WORLDS_TEXT if "Bullet" in str(environments) else "")
+        short = (
+            env.removesuffix("Deterministic").removesuffix("BulletEnv") for env in environments
+        )
+        assert all(env.removesuffix("200") in named for env in short)
+    for name, last in (("tuned", 219), ("published", 209)):  # a run takes long
+        assert max(seed for env, _, seed in runs[name] if env.startswith("Hopper")) == last
+        assert f"| | Hopper | the same | 200 to {last} |" in WORLDS_TEXT
+
+
+def test_the_worlds_are_asked_what_their_page_has() -> None:
+    study = world("tuned")
+    claims = read_claims(study, ROOT / study.claims)
+    parts = [
+        sum(len(part.each(claims.table1)) for part in one.parts[ROBUST])
+        for family in claims.families.values()
+        for one in family.claims.values()
+    ]
+    assert parts[:10] == [2, 2, 2, 2, 2, 3, 4, 2, 3, 2] and claims.rule == 2  # C1 to C10
+    assert parts[10:21] == [4, 4, 4, 6, 5, 3, 1, 4, 3, 1, 3]  # W1 to W4, Q1, Q6, Q8, P1 to P3
+    said = f"the ten claims ({sum(parts[:10])} parts), the four W ({sum(parts[10:14])}), the three"
+    assert f"{said} Q ({sum(parts[14:17])}) and the three P ({sum(parts[17:20])})" in WORLDS_TEXT
+    families = list(claims.families.values())
+    for name, one in CLAIMED.claims.items():  # the confirmation's, but for C9
+        for way, parts in one.parts.items():
+            now = families[0].claims[name].parts[way]
+            metrics = [part.metric.replace(CORRELATION, BEFORE) for part in parts]
+            renamed = zip(parts, metrics, strict=True)
+            assert now == [part.model_copy(update={"metric": metric}) for part, metric in renamed]
+    assert f"`{BEFORE}`" in WORLDS_TEXT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["tuned", "plain", "published", "tasks"])
+def test_what_is_kept_of_a_world_came_after_its_page_and_from_one_state_of_the_code(folder) -> None:
+    records = kept(ROOT / "reference" / "worlds" / folder, range(200, 300))
+    names = ["questions", "controls"] if folder == "tasks" else [folder]
+    assert records.keys() <= {run for name in names for run in world(name).runs()}
+    come_after(WORLDS_PAGE, records)
+
+
+def kept(archives: Path, seeds: range) -> dict[tuple[str, str, int], dict]:
+    """run.json of every kept run of these seeds."""
+    records = [
+        json.loads(content)
+        for archive in sorted(archives.glob("*/*.tar.xz"))
+        for name, content in kept_runs.read(archive).items()
+        if name.endswith(files.RECORD)
+    ]
+    found = {
+        tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
+        for record in records
+    }
+    return {run: record for run, record in found.items() if run[2] in seeds}
+
+
+def come_after(page: Path, records: dict[tuple[str, str, int], dict]) -> None:
+    """All are of one state of the code, which is later than the page's last commit."""
+    git, told = ["git", "-C", str(ROOT)], {"capture_output": True, "text": True}
+    shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
+    if shallow.stdout.strip() != "false" or not records:
+        pytest.skip("not a git repository with its whole history, or no run is kept yet")
     ((commit, dirty),) = {tuple(record["code"].values()) for record in records.values()}
     assert not dirty and len({record["sources"] for record in records.values()}) == 1
-    log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(PAGE)], check=True, **told)
+    log = subprocess.run([*git, "log", "-1", "--format=%H", "--", str(page)], check=True, **told)
     subprocess.run([*git, "merge-base", "--is-ancestor", log.stdout.strip(), commit], check=True)
 
 

@@ -217,13 +217,20 @@ def laughs(form: str) -> bytes:
     return "\n".join(["x0: &x0 {a: 1}", *rest]).encode()
 
 
-FILES = sorted({path.name for path in (CONFIG.parent / "config").glob("*.yaml")} - {"claims.yaml"})
+FILES = sorted(
+    {*(CONFIG.parent / "config").rglob("*.yaml")} - {CONFIG.parent / "config/claims.yaml"}
+)
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_every_study_of_the_project_can_be_carried_out(name: str) -> None:
-    below = ["questions.yaml"] if name == "controls.yaml" else []
-    study = read_study([CONFIG, *(CONFIG.parent / "config" / one for one in (*below, name))])
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_study_of_the_project_can_be_carried_out(path: Path) -> None:
+    """By the command that its file has."""
+    (files,) = re.findall(
+        "^#.* --configfile ([a-z./ ]*[a-z])", path.read_text("utf-8"), re.MULTILINE
+    )
+    layers = [CONFIG.parent / name for name in files.split()]
+    assert layers[-1] == path
+    study = read_study([CONFIG, *layers])
     for run in study.runs():
         study.run_config(*run)
     study.metrics.within(study.environments, study.variants)

@@ -33,7 +33,7 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
         run.run(study.run_config("CartPole-v1", "ppo", seed), folder)
     kept_runs.pack(tmp_path / "results", tmp_path / "reference/study")
     wanted = {"configuration": "config", "configfiles": ["config/small.yaml"], "config": []}
-    wanted["outputs"] = ["metrics.csv", "figure1.png"]
+    wanted |= {"runs": "reference/study", "outputs": ["metrics.csv", "figure1.png"]}
     studies, kept = tmp_path / "reference/studies.yaml", tmp_path / "reference/tables/small"
     studies.write_text(yaml.safe_dump({"small": wanted}))
 

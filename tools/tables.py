@@ -3,10 +3,11 @@
     python -m tools.tables [--check]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-The runs in `KEPT` are unpacked, and Snakemake makes of them, in results/tables/STUDY and by the
+The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY and by the
 configuration that the study had, the outputs that reference/studies.yaml names, and README.md:
-tables.md with the pictures that are among these, and the verdicts of the first study beside those
-of this one. They are compared with those in reference/tables. New ones are kept there, and
+tables.md with the pictures that are among these, and for the confirmation's studies the verdicts of
+the first study beside theirs. What the worlds of docs/worlds-protocol.md say together comes into
+results/tables/worlds. All is compared with reference/tables. New files are kept there, and
 README.md, which only shows the others, is renewed;
 with --check both are mistakes. With --report only the page of one study is made, and not compared.
 """
@@ -29,12 +30,12 @@ from mace_rl.config.reading import read_yaml
 from mace_rl.study.compare.ledger import Answer, answer_of, read_ledger
 from mace_rl.study.show.markdown import markdown
 from mace_rl.study.show.tables import parts
-from tools import kept_runs
+from tools import kept_runs, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 CORES = len(os.sched_getaffinity(0))
 
-KEPT, STUDIES = Path("reference/study"), Path("reference/studies.yaml")
+STUDIES, CONFIRMATION = Path("reference/studies.yaml"), "reference/study"
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 FIRST = Path("reference/measured/first_study.json")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
@@ -54,7 +55,7 @@ def make(name: str, study: dict[str, Any]) -> None:
     """
     folder = ROOT / MADE / name
     folder.mkdir(parents=True)
-    (folder / "runs").symlink_to("../runs", target_is_directory=True)
+    (folder / "runs").symlink_to(ROOT / MADE / study["runs"] / "runs", target_is_directory=True)
     (folder / "config").symlink_to(ROOT / study["configuration"], target_is_directory=True)
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
     command += ["--cores", str(CORES), "--allowed-rules", *RULES]
@@ -74,12 +75,13 @@ def make_all(studies: dict[str, Any]) -> None:
         list(pool.map(make, studies, studies.values()))
 
 
-def write_readme(name: str, outputs: list[str]) -> None:
+def write_readme(name: str, study: dict[str, Any], outputs: list[str]) -> None:
     """README.md of a study, beside what is kept of it: its name, its tables, these pictures."""
     text = (MADE / name / TABLES).read_text(encoding="utf-8")
     text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
     text = re.sub("^# .*", f"# {name}", text)
-    if (ledger := MADE / name / "claims.json").exists():
+    ledger = MADE / name / "claims.json"
+    if ledger.exists() and study["runs"] == CONFIRMATION:
         first = [answer_of(record) for record in json.loads(FIRST.read_bytes())]
         text += beside_the_first(first, read_ledger(ledger))
     (MADE / name / README).write_text(text, encoding="utf-8")
@@ -134,11 +136,12 @@ def main() -> None:
     studies = read_yaml(STUDIES)
     if only and only not in studies:
         sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
-    for stale in [MADE / "runs", MADE / only] if only else [MADE]:
+    wanted = {only: studies[only]} if only else studies
+    archives = dict.fromkeys(study["runs"] for study in wanted.values())
+    for stale in [MADE / only, *(MADE / archive for archive in archives)] if only else [MADE]:
         if stale.exists():
             shutil.rmtree(stale)
-    runs = kept_runs.unpack(KEPT, MADE)
-    wanted = {only: studies[only]} if only else studies
+    runs = sum(kept_runs.unpack(Path(archive), MADE / archive) for archive in archives)
     outputs = {name: [PAGE] if only else study["outputs"] for name, study in wanted.items()}
     try:
         make_all(
@@ -150,8 +153,10 @@ def main() -> None:
         print(MADE / only / PAGE)
         return
     for name in outputs:
-        write_readme(name, outputs[name])
+        write_readme(name, studies[name], outputs[name])
         outputs[name] = [*outputs[name], README]
+    if outputs.keys() >= set(worlds.WORLDS):
+        outputs[worlds.FOLDER] = worlds.make(MADE)
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
     print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")

@@ -44,7 +44,7 @@ class Table1Config(Section):
 
     caption: str  # the names of its metrics
     metrics: Names  # readings of one are the metrics whose names begin with its name
-    shuffled: list[str] = Field(default=[])  # readings that are asked of shuffled returns, too
+    public_code: list[str] = Field(default=[])  # the same by the public code; asked of noise, too
     variants: Annotated[dict[str, str], Field(min_length=1)]  # and what the ledger calls them
     # By environment and variant a number for each metric.
     values: dict[str, dict[str, list[int | float]]]
@@ -212,7 +212,7 @@ def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
     """What the file names: key, kind and names."""
     table1 = claims.table1
     yield "table1.metrics", "measured", table1.metrics
-    yield "table1.shuffled", "measured", table1.shuffled
+    yield "table1.public_code", "measured", table1.public_code
     yield "table1.variants", "variant", table1.variants
     yield "table1.values", "environment", table1.values
     yield "table2", "setting", [*claims.table2.rows, *claims.table2.others]

@@ -61,7 +61,7 @@ def readings(
         for kind in dict.fromkeys(kind for kind, _ in found):
             parts.append(_published(environment, kind, list(frames), table1))
         for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
-            if source == RUNS or metric.name in table1.shuffled:
+            if source == RUNS or metric.name in table1.public_code:
                 both = means[source], runs[source]
                 rows, own = (table[table["env"] == environment] for table in both)
                 rows = _measured(rows[rows["metric"] == metric.name], own, metric, settings)

@@ -8,13 +8,7 @@ import numpy as np
 import scipy  # loads what is used of it when it is
 
 from mace_rl.records import RunKey
-from mace_rl.study.measure.metrics import (
-    LearningCurve,
-    final_return,
-    learning_curve,
-    sample_efficiency_common,
-    slope,
-)
+from mace_rl.study.measure import metrics
 from mace_rl.study.metrics_config import MetricsConfig
 
 if TYPE_CHECKING:  # planning the workflow imports this module
@@ -39,8 +33,8 @@ def betas_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) 
 
     rows = []
     for run, frame in runs.items():
-        beta, curve = frame["beta"].to_numpy(), learning_curve(frame, run[0], settings)
-        end = final_return(beta, settings.final_fraction)
+        beta, curve = frame["beta"].to_numpy(), metrics.learning_curve(frame, run[0], settings)
+        end = metrics.final_return(beta, settings.final_fraction)
         found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
         found += stagnation_correlations(curve, beta) if settings.reference_return else []
         rows.append([*run, end, beta.min(), beta.max(), *found])
@@ -52,16 +46,16 @@ def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) 
 
     returns, betas: [E]. Stagnation is minus the `slope`.
     """
-    return _correlation(-slope(returns, window), betas)
+    return _correlation(-metrics.slope(returns, window), betas)
 
 
-def stagnation_correlations(curve: LearningCurve, betas: np.ndarray) -> tuple[float, float]:
+def stagnation_correlations(curve: metrics.LearningCurve, betas: np.ndarray) -> tuple[float, float]:
     """The same, by the `growing_slope`, before and after `sample_efficiency_common`.
 
     betas: [E]. An episode's stagnation and the next one's β are before that episode if both are.
     0, too, for a time of which there are fewer than two.
     """
-    reached = sample_efficiency_common(curve)
+    reached = metrics.sample_efficiency_common(curve)
     stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
     until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
     before = _correlation(stagnation[:until], betas[: reached.number])
@@ -76,8 +70,8 @@ def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
     """
     first = 2 * math.ceil(window / 10)
     ends = range(first, min(2 * window, len(returns) + 1))
-    growing = [slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
-    return np.concatenate([*growing, slope(returns, window)])
+    growing = [metrics.slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
+    return np.concatenate([*growing, metrics.slope(returns, window)])
 
 
 def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:

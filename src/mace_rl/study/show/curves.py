@@ -142,7 +142,7 @@ def draw_figure(
             axes.set_xlim(0, own["episode"].max())
             axes.locator_params(nbins=4)
             axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))
-            _draw(axes, own, look)
+            draw_means(axes, own, look)
             seeds = own.groupby("variant")["n"].max()
             for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
                 faint: dict[str, Any] = {"color": look.colours[variant], "linewidth": 0.5}
@@ -152,7 +152,7 @@ def draw_figure(
             share = look.layout.inset
             if share and shown.limits is None and _is_early(own, share):
                 inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
-                _draw(inset, own[own["episode"] <= share * own["episode"].max()], look)
+                draw_means(inset, own[own["episode"] <= share * own["episode"].max()], look)
                 inset.set_xlim(0, share * own["episode"].max())
                 inset.locator_params(nbins=3)
                 inset.tick_params(labelsize="x-small")
@@ -243,7 +243,7 @@ def _is_early(curves: pd.DataFrame, share: float) -> bool:
     return bool((risen > MOSTLY * (means.max() - means.min())).all())
 
 
-def _draw(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
+def draw_means(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
     """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
     drawn: list[np.ndarray] = []
     near = HIDDEN * np.ptp(curves["mean"])

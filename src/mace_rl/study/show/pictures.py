@@ -194,7 +194,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     reach = max(1, np.nanmax(ends.to_numpy()))
     claims = table.groupby("claim", sort=False)[["claim", "statement"]].first()
     width = 20 if table["measured"].nunique() > 1 else 40  # letters, beside what the parts are
-    said = {str(name): _wrapped(" ".join(own), width) for name, own in claims.T.items()}
+    said = {str(name): wrapped(" ".join(own), width) for name, own in claims.T.items()}
     table, blocks = _placed(table, {name: len(text.splitlines()) for name, text in said.items()})
     count, ways = max(end for _, end in blocks.values()), table["measured"].unique()
     with style():
@@ -236,7 +236,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     return figure
 
 
-def _wrapped(words: str, width: int) -> str:
+def wrapped(words: str, width: int) -> str:
     """Lines of words, of which a name and its number stay together."""
     return textwrap.fill(words.replace(" β", "\u00a0β").replace(" = ", "\u00a0=\u00a0"), width)
 

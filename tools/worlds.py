@@ -1,0 +1,134 @@
+"""What the worlds of docs/worlds-protocol.md say together, from what Snakemake made in each.
+
+    python -m tools.worlds FOLDER      for example results/worlds; `make tables` does it, too
+
+FOLDER/WORLD has the metrics.csv, claims.json and figure1.csv of each of `WORLDS`. Into
+FOLDER/worlds come the verdicts of all, the paper's Table 1 as a draw, and their pictures.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from mace_rl.study.claims_config import read_claims
+from mace_rl.study.compare.draw import draw, numbers
+from mace_rl.study.compare.ledger import read_ledger
+from mace_rl.study.config import read_study
+from mace_rl.study.show import worlds
+from mace_rl.study.show.curves import PlotStyle, plot_style, quantity, save_figure
+from mace_rl.study.show.markdown import page
+from mace_rl.study.show.sections import Section
+
+WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
+CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
+WAYS = {"robust": "verdicts", "by the paper's words and code": "verdicts_by_words"}
+ORIGIN = (
+    f"From {', '.join(f'[{world}](../{world})' for world in WORLDS)}, by `python -m tools.worlds`."
+)
+
+
+def make(folder: Path) -> list[str]:
+    """Make FOLDER/worlds; returns what it then has."""
+    study = read_study([CONFIG])
+    claims = read_claims(study, CONFIG.parent / study.claims)
+    look = plot_style(study.metrics, study.figure.model_dump(), study.labels, study.colours)
+    runs = {world: pd.read_csv(folder / world / "metrics.csv") for world in WORLDS}
+    answers = {world: read_ledger(folder / world / "claims.json") for world in WORLDS}
+    curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in WORLDS}
+    goal = folder / FOLDER
+    goal.mkdir(exist_ok=True)
+    tables = {name: worlds.verdicts(answers, way) for way, name in WAYS.items()}
+    tables["numbers"] = pd.concat(
+        [numbers(own, claims.table1).assign(world=world) for world, own in runs.items()]
+    )
+    draws = [draw(own, claims.table1)._asdict() | {"world": world} for world, own in runs.items()]
+    tables["draws"] = pd.DataFrame(draws)
+    pictures = {
+        "verdicts": worlds.draw_verdicts(tables["verdicts"]),
+        "numbers": worlds.draw_numbers(runs, claims.table1, look),
+        "curves": worlds.draw_curves(curves, quantity("1", study.metrics), look),
+    }
+    for name, table in tables.items():
+        table.to_csv(goal / f"{name}.csv", index=False)
+    for name, picture in pictures.items():
+        save_figure(picture, goal / f"{name}.png")
+    text = page("worlds", ORIGIN, _sections(tables, look), list(pictures))
+    (goal / "README.md").write_text(text, encoding="utf-8")
+    return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
+
+
+def records(table: pd.DataFrame) -> Any:
+    """Its rows, with their columns as attributes."""
+    return table.itertuples()
+
+
+def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]:
+    """The tables in words, for README.md."""
+    said = "{verdict}; {shown} of {parts} shown; room {least_room:.2g} to {most_room:.2g}"
+    sections = []
+    for way, name in WAYS.items():
+        rows: Any = tables[name].to_dict("records")
+        long = tables[name].assign(said=[said.format(**row) for row in rows])
+        wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
+        order = long[["claim", "statement"]].drop_duplicates()
+        frame = order.merge(wide[list(WORLDS)].reset_index()).fillna("")
+        sections.append(Section(f"Verdicts: {way}", "Room: of its parts, in margins.", frame))
+    table = tables["numbers"]
+    cells = table.assign(
+        number=table["env"]
+        + ", "
+        + table["variant"].map(look.labels)
+        + ", "
+        + table["metric"].map(look.metrics).str.lower(),
+        seeds=[
+            f"{row.median:.0f} ({row.low:.0f} to {row.high:.0f})" + (" *" if row.unusual else "")
+            for row in records(table)
+        ],
+    )
+    wide = cells.pivot(index=["number", "paper"], columns="world", values="seeds")
+    order = cells[["number", "paper"]].drop_duplicates()
+    frame = order.merge(wide[list(WORLDS)].reset_index()).astype({"paper": int}).map(str)
+    note = (
+        "Median and central 90 % of each world's seeds. *: the paper's number is not among these."
+    )
+    sections.append(Section("The paper's 18 numbers", note, frame))
+    rows = [
+        [
+            row.world,
+            f"{row.unusual} of {row.numbers}",
+            f"{row.limit}",
+            f"{row.chance_unusual:.2g}",
+            f"{row.chance_first:.3f}",
+            f"{row.chance_any:.3f}",
+        ]
+        for row in records(tables["draws"])
+    ]
+    first = tables["draws"].iloc[0]
+    columns = ["world", "unusual", "unlike from", "chance of as many", "as favourable", "by chance"]
+    note = (
+        "One seed of each variant as Table 1. *Chance of as many*: of as many unusual numbers."
+        f" *As favourable*: {look.labels[first['favoured']]} is first in {first['first']} columns"
+        " or more; *by chance*: a variant that is drawn anew in each environment."
+    )
+    sections.append(Section("The table as a draw", note, pd.DataFrame(rows, columns=columns)))
+    return sections
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.worlds results/worlds"
+    )
+    parser.add_argument("folder", type=Path, help="where the worlds' folders are")
+    folder = parser.parse_args().folder
+    try:
+        print(*(folder / FOLDER / name for name in make(folder)), sep="\n")
+    except FileNotFoundError as error:
+        sys.exit(f"worlds: {error.filename} is not there: Snakemake makes it of each world")
+
+
+if __name__ == "__main__":
+    main()
