@@ -291,8 +291,9 @@ def test_global_generators_are_left_alone(run_config, settings):
 )
 def test_state_holds_all_that_the_rest_depends_on(run_config, environment, variant, settings):
     """Continued by a new trainer from what a file would hold, with several episodes a rollout."""
-    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}, "novelty": SOON}
-    changes["meta"] = {"horizon": 2, "credit_threshold": 0.0}  # so that each credit moves β
+    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}}
+    changes["novelty"] = SOON | {"refresh_every": 60}  # so that some states wait
+    changes["meta"] = {"horizon": 2, "credit_threshold": 0.0}  # and each credit moves β
     config = run_config(environment, variant, 2, **merge(SETTINGS[settings], changes))
     whole = Trainer(config)
     rounds = whole.run()
