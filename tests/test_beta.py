@@ -58,10 +58,17 @@ def test_features_by_hand():
 
 @pytest.mark.parametrize(("budget", "windows"), [(30, 30), (100, 100), (250, 100), (6000, 100)])
 def test_windows_of_any_budget(budget, windows):
-    """A hundred, or one per episode; all features stay small whatever is paid."""
-    gauge, rng = Gauge(budget), np.random.default_rng(0)
+    """A hundred, or one per episode; all features stay small whatever is paid.
+
+    One that is saved and restored after each episode has the same.
+    """
+    gauge, other, rng = Gauge(budget), Gauge(budget), np.random.default_rng(0)
     for n in range(budget):
-        gauge.update(1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3)
+        told = 1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3
+        saved, other = other.state_dict(), Gauge(budget)
+        other.load_state_dict(saved)
+        assert gauge.update(*told) == other.update(*told)
+    assert (gauge.sequence() == other.sequence()).all()
     assert len(gauge.windows) == windows and np.abs(gauge.sequence()).max() <= 4
     assert gauge.windows[-1][0] == pytest.approx(1)
 
