@@ -19,9 +19,7 @@ import mace_rl.pins  # noqa: F401  isort: skip  (pins NumPy before it is importe
 import gymnasium
 import pytest
 
-from mace_rl.config.reading import merge_layers
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import check
 from mace_rl.environments import registered
 from mace_rl.study.config import Study, read_study
 
@@ -57,8 +55,7 @@ def run_config(study: Study) -> Callable[..., RunConfig]:
     """
 
     def make(environment="CartPole-v1", variant="ppo", seed=0, **changes: Any) -> RunConfig:
-        settings = study.run_config(environment, variant, seed).settings()
-        return check(RunConfig, merge_layers(settings, changes), "the test")
+        return study.run_config(environment, variant, seed, changes)
 
     return make
 

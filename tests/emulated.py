@@ -25,16 +25,10 @@ class Interrupted(Exception):
 
 def train(environment: str, variant: str, folder: str, halt: bool) -> None:
     """Train, or begin to: half of the episodes, and what is left is a checkpoint."""
-    from mace_rl.config.reading import DEFAULTS, merge_layers
-    from mace_rl.config.run import RunConfig
-    from mace_rl.config.section import check
+    from mace_rl import settings
     from mace_rl.runs import run
-    from mace_rl.study.config import read_study
 
-    settings = read_study([DEFAULTS]).run_config(environment, variant, 0).settings()
-    changes: dict[str, Any] = {key: value for key, value in CHANGES.items() if key in settings}
-    changes["episodes"] = EPISODES[environment]
-    config = check(RunConfig, merge_layers(settings, changes), "tests/emulated.py")
+    config = settings(environment, variant, episodes=EPISODES[environment], **CHANGES)
     if not halt:
         run.run(config, Path(folder))
         return

@@ -13,7 +13,8 @@ from mace_rl.study.claims_config import parse_claims, parts_of
 from mace_rl.study.compare.aggregate import SCORED
 from mace_rl.study.compare.ledger import Finding
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import CORRELATION, Metric, metrics_columns
+from mace_rl.study.measure.betas import CORRELATION
+from mace_rl.study.measure.metrics import LearningCurve, Metric, final_return, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 
 SETTINGS = {"final_fraction": 0.1, "threshold": 0.75, "moving_average": 50, "comparisons": []}
@@ -35,7 +36,8 @@ by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be as
 BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
-QUESTIONED = QUESTIONED.model_copy(update={"bootstrap_repetitions": 1000})
+FEW = {"bootstrap_repetitions": 1000}
+QUESTIONED, QUICK = (metrics.model_copy(update=FEW) for metrics in (QUESTIONED, STUDY.metrics))
 
 EPISODES = {"Acrobot-v1": 2000, "CartPole-v1": 2000, "HopperBulletEnv-v0": 6000}
 LEARNED = {"Acrobot-v1": -85.0, "CartPole-v1": 500.0, "HopperBulletEnv-v0": 1500.0}
@@ -51,10 +53,38 @@ def noisy(seed: int, episodes: int = 400) -> np.ndarray:
     return np.round(level + generator.normal(size=episodes) * 10)
 
 
+def episode_columns(episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Those of episodes.csv, of random doubles."""
+    draws = np.random.default_rng(seed)
+    length = draws.integers(1, 500, episodes)
+    return {
+        "episode": np.arange(1, episodes + 1),
+        "env_steps": np.cumsum(length),
+        "length": length,
+        "extrinsic_return": draws.normal(size=episodes) * 10.0 ** draws.integers(-20, 20, episodes),
+        "intrinsic_return": draws.exponential(size=episodes),
+        "beta": draws.random(episodes) ** 20,
+        "terminated": draws.integers(0, 2, episodes),
+    }
+
+
 def frame(returns: np.ndarray, length: int = 1) -> pd.DataFrame:
     """The records of a run with these returns, every episode of this length."""
     episodes = np.arange(1, len(returns) + 1)
     return pd.DataFrame({"extrinsic_return": returns, "env_steps": episodes * length})
+
+
+def curve(returns, final=None, random=-1e9, goals=(), **settings):
+    """What a metric gets; settings that are not given are those of `CONFIG`."""
+    returns, changed = np.asarray(returns, float), CONFIG.model_copy(update=settings)
+    final = final_return(returns, 0.1) if final is None else final
+    return LearningCurve(returns, final, random, changed, *goals)
+
+
+def averages(returns, window):
+    """Moving averages by episode number (from 1), from pandas."""
+    rolling = pd.Series(returns).rolling(window).mean()
+    return {t + 1: value for t, value in enumerate(rolling) if not np.isnan(value)}
 
 
 def table_for_tables(

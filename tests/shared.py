@@ -30,6 +30,8 @@ ROOT = Path(__file__).parents[1]
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
 VARIANTS = ["ppo", "mace_fixed", "mace_full"]
+NETWORKS = ["actor", "extrinsic", "intrinsic"]
+SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 LAYER_NORM = {"kind": "torch", "module": "shared:layer_norm"}  # as `ppo.network`
 
 # What is in the folder of a run, at its end and before.

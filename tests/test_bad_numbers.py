@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
-from shared import Bonanza, Twin, finish
+from shared import NETWORKS, SOON, Bonanza, Twin, finish
 
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.refusal import Refusal
 from mace_rl.trainer import Trainer
-
-NETWORKS = ["actor", "extrinsic", "intrinsic"]
-SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 
 
 @pytest.mark.parametrize(
@@ -48,14 +45,11 @@ def moved(unit: float, offset: float, reward: float = 0.0) -> gymnasium.Env:
     return TransformObservation(env, lambda x: x * [unit, 1.0] + [offset, 0.0], space)
 
 
-LOST = "differences in observation[0]"
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        *(((unit, offset), LOST) for unit, offset in ((1e-9, 0), (1, 1e8), (1, 1e7))),
-        *(((unit, offset), "") for unit, offset in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
+        *((given, "differences in observation[0]") for given in ((1e-9, 0), (1, 1e8), (1, 1e7))),
+        *((given, "") for given in ((1, 1e4), (1e-6, 0), (0, 0.3), (0, 12345.6))),
         ((1, 0, 1e11), "the rewards of episode 4"),
     ],
 )

@@ -1,36 +1,28 @@
 """β by schedule and by meta-adaptation: each against a computation of its own."""
 
-import copy
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from shared import environment_of, finish
+from shared import ROOT, environment_of, finish
 
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.config.section import ConfigError
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
 from mace_rl.study.config import read_study
 
-ROOT = Path(__file__).parents[1]
-SCHEDULE = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
-
 
 def episode_of(extrinsic_return: float) -> Episode:
-    """Of eight steps."""
     rewards = np.r_[np.zeros(7), extrinsic_return]
     return Episode(np.zeros((9, 1)), np.zeros(8, int), np.zeros(8), rewards, True)
 
 
-# --- Schedules ----------------------------------------------------------------------------------
-
+HALVED = {"kind": "exponential", "initial": 0.4, "decay": 0.5, "floor": 0.06}
 PAPER_S = 0.999 ** np.arange(5000)
 
 
@@ -38,7 +30,7 @@ PAPER_S = 0.999 ** np.arange(5000)
     ("beta", "expected"),
     [
         ({"kind": "constant", "value": 0.3}, [0.3] * 3),
-        (SCHEDULE, [0.4, 0.2, 0.1, 0.06, 0.06]),
+        (HALVED, [0.4, 0.2, 0.1, 0.06, 0.06]),
         ({"variant": "mace_fixed"}, np.maximum(0.4 * PAPER_S, 0.01)),
         ({"variant": "mace_fixed_0.2"}, np.maximum(0.2 * PAPER_S, 0.01)),
         ({"variant": "mace_fixed_0.6"}, np.maximum(0.6 * PAPER_S, 0.01)),
@@ -54,27 +46,6 @@ def test_schedules_by_hand(run_config, beta, expected):
     assert betas == pytest.approx(expected) and not rule.learns
 
 
-@pytest.mark.parametrize(
-    ("beta", "message"),
-    [
-        (
-            {"kind": "constant", "value": 10.5},
-            "beta.value is 10.5, but .* less than or equal to 10",
-        ),
-        ({"kind": "constant"}, "the key 'beta.value' is missing"),
-        (SCHEDULE | {"floor": 0.5}, "beta .* floor is 0.5, which must not exceed initial, 0.4"),
-        (SCHEDULE | {"flor": 0.1}, "unknown key 'beta.flor' .* 'floor'"),
-    ],
-)
-def test_wrong_settings_get_one_line(run_config, beta, message):
-    with pytest.raises(ConfigError, match=message) as caught:
-        run_config("CartPole-v1", "mace_fixed", beta=beta)
-    assert "\n" not in str(caught.value)
-
-
-# --- What the LSTM reads ------------------------------------------------------------------------
-
-
 def test_features_by_hand():
     """Two episodes a window; returns 0 and 1, bonus 1, then a tenth of it a step."""
     gauge = Gauge(200)
@@ -87,15 +58,19 @@ def test_features_by_hand():
 
 @pytest.mark.parametrize(("budget", "windows"), [(30, 30), (100, 100), (250, 100), (6000, 100)])
 def test_windows_of_any_budget(budget, windows):
-    """A hundred, or one per episode; all features stay small whatever is paid."""
-    gauge, rng = Gauge(budget), np.random.default_rng(0)
+    """A hundred, or one per episode; all features stay small whatever is paid.
+
+    One that is saved and restored after each episode has the same.
+    """
+    gauge, other, rng = Gauge(budget), Gauge(budget), np.random.default_rng(0)
     for n in range(budget):
-        gauge.update(1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3)
+        told = 1e6 * rng.standard_normal(), rng.random() / (1 + n) ** 3, 3
+        saved, other = other.state_dict(), Gauge(budget)
+        other.load_state_dict(saved)
+        assert gauge.update(*told) == other.update(*told)
+    assert (gauge.sequence() == other.sequence()).all()
     assert len(gauge.windows) == windows and np.abs(gauge.sequence()).max() <= 4
     assert gauge.windows[-1][0] == pytest.approx(1)
-
-
-# --- Meta-adaptation ----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -157,22 +132,6 @@ def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(m
     searching, advancing = np.split(np.array(betas), 2)
     assert searching[50:300].min() > 0.7 and advancing[50:300].min() > 0.7
     assert advancing[600:].max() < 0.3
-
-
-def test_restored_it_continues_to_the_bit(make):
-    one, other, rng = make(50, horizon=3), make(50, horizon=3), np.random.default_rng(0)
-    for n in range(50):
-        if n == 20:
-            other.load_state_dict(copy.deepcopy(one.state_dict()))
-        vectors = rng.standard_normal((2, 9)).astype(np.float32)
-        for meta in (one, other)[: 1 + (n >= 20)]:
-            meta.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
-            meta.learn(vectors[0], 0.5, Effect(vectors[1], 0.5))
-        assert n < 20 or one.beta == other.beta
-    assert one.integrator.logit == other.integrator.logit and one.integrator.count == 47
-
-
-# --- Credit -------------------------------------------------------------------------------------
 
 
 def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(make):

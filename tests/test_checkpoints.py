@@ -16,8 +16,6 @@ from gymnasium.spaces import Box, Discrete
 from shared import RESULTS, Killed, content_of, provenance_of
 
 from mace_rl import sources
-from mace_rl.config.reading import merge_layers
-from mace_rl.config.run import RunConfig
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.trainer import Trainer
 
@@ -51,7 +49,7 @@ def test_damaged_checkpoint_is_not_continued(
     assert not Path("executed").exists()
 
 
-def test_another_unfinished_run_is_not_lost(interrupted, monkeypatch, caplog, kill):
+def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch, caplog):
     config, directory = interrupted.config, interrupted.directory
     before = content_of(directory)
     found = provenance.versions()
@@ -63,7 +61,7 @@ def test_another_unfinished_run_is_not_lost(interrupted, monkeypatch, caplog, ki
         ({}, (sources, "digest", lambda *paths: "0" * 64), "unfinished run of other code, in mace"),
     ]
     for number, (changes, replaced, message) in enumerate(others, start=1):
-        other = RunConfig.model_validate(merge_layers(config.settings(), changes))
+        other = run_config("CartPole-v1", "mace_full", **{"episodes": 6} | changes)
         with monkeypatch.context() as patched:
             if replaced:
                 patched.setattr(*replaced)

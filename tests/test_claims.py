@@ -16,6 +16,7 @@ from invented import (
     PAPERS,
     QUESTIONED,
     QUESTIONS,
+    QUICK,
     ROBUST,
     ROOT,
     STUDY,
@@ -29,8 +30,7 @@ from mace_rl.records import RecordError
 from mace_rl.study.claims_config import ClaimsConfig, parts_of, read_claims
 from mace_rl.study.compare import direction_and_size, verdicts
 from mace_rl.study.compare.ledger import Finding, SizedFinding, read_ledger, to_json
-from mace_rl.study.config import Study
-from mace_rl.study.measure.metrics import CORRELATION
+from mace_rl.study.measure.betas import CORRELATION
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
@@ -42,9 +42,13 @@ SLIGHT = {"ppo": 0.0, "mace_fixed": 0.01, "mace_full": 0.03}
 BUT_C6 = [f"C{number}" for number in range(1, 11) if number != 6]  # which says that fixed is first
 OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
 
+# Of a `Finding`: what it is of, and what is between its interval and its corrected p values.
+FOUND = ("CartPole-v1",), "final_return", "mace_full", "ppo", "return"
+FIT = 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001
 
-def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
-    answers = verdicts.ledger(frame, study.metrics, PAPERS)
+
+def found_of(frame: pd.DataFrame, claim: str) -> list[Finding]:
+    answers = verdicts.ledger(frame, STUDY.metrics, PAPERS)
     (answer,) = (one for one in answers if one.claim == claim)
     return answer.ways[ROBUST].parts
 
@@ -70,12 +74,9 @@ def found_of(frame: pd.DataFrame, study: Study, claim: str) -> list[Finding]:
         (2, 12, SMALL, 0.3, BUT_C6, "open"),
     ],
 )
-def test_verdicts_where_the_truth_is_known(
-    study, rule, seeds, advantage, noise, which, expected
-) -> None:
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
+def test_verdicts_where_the_truth_is_known(rule, seeds, advantage, noise, which, expected) -> None:
     claims = {1: PAPERS, 2: BY_SIZE}[rule]
-    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), settings, claims)
+    answers = verdicts.ledger(table_for_claims(seeds, advantage, noise), QUICK, claims)
     found = {one.claim: {judged.verdict for judged in one.ways.values()} for one in answers}
     assert {name: found[name] for name in which} == {name: {expected} for name in which}
 
@@ -94,11 +95,7 @@ def test_verdicts_where_the_truth_is_known(
 )
 def test_a_part_by_the_written_rule(seeds, difference, p_holm, p_equivalent_holm, expected) -> None:
     """The p values that are not corrected say nothing."""
-    finding = Finding(
-        *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", seeds, difference),
-        *(-99.0, 99.0, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001),
-        *(p_holm, p_equivalent_holm),
-    )
+    finding = Finding(*FOUND, seeds, difference, -99.0, 99.0, *FIT, p_holm, p_equivalent_holm)
     assert (finding.p_value, finding.p_equivalent) == (0.0001, 0.0001)
     assert verdicts.outcome(finding) == expected
 
@@ -116,9 +113,8 @@ def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
         assert verdicts.verdict(found) == expected
 
 
-def test_all_parts_are_corrected_together_and_have_their_margins(study: Study) -> None:
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), settings, PAPERS)
+def test_all_parts_are_corrected_together_and_have_their_margins() -> None:
+    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), QUICK, PAPERS)
     for how in (LITERAL, ROBUST):
         parts = [part for answer in answers for part in answer.ways[how].parts]
         # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
@@ -134,15 +130,14 @@ def test_all_parts_are_corrected_together_and_have_their_margins(study: Study) -
         margins = {(part.metric, *part.environments): part.worth_mentioning for part in parts}
         for environment in EPISODES:
             assert margins[CORRELATION, environment] == 0.05
-            reference = study.metrics.reference_return[environment]
-            span = reference - study.metrics.random_return_in(environment)
+            span = QUICK.reference_return[environment] - QUICK.random_return_in(environment)
             assert margins["final_return", environment] == pytest.approx(span / 20)
         assert [margins[key] for key in margins if len(key) == 4] == [0.05]  # over all
 
 
-def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
+def test_a_part_is_what_paired_statistics_say() -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    part = found_of(frame, study, "C1")[0]
+    part = found_of(frame, "C1")[0]
     assert (part.variant, part.baseline) == ("mace_full", "ppo")
     runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])
     times = runs["sample_efficiency_common"]
@@ -155,47 +150,46 @@ def test_a_part_is_what_paired_statistics_say(study: Study) -> None:
     u = scipy.stats.mannwhitneyu(times["ppo"], times["mace_full"]).statistic
     assert part.probability == pytest.approx(u / 144)
     # Verdicts are of 95 % intervals, whatever those of the tables have.
-    wide = study.metrics.model_copy(update={"confidence": 0.5})
+    wide = STUDY.metrics.model_copy(update={"confidence": 0.5})
     assert verdicts.ledger(frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
 
 
-def test_a_seed_that_one_variant_lacks_is_an_error(study: Study) -> None:
+def test_a_seed_that_one_variant_lacks_is_an_error() -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     own = (frame["env"] == "CartPole-v1") & (frame["variant"] == "ppo") & (frame["seed"] == 5)
     with pytest.raises(RecordError, match=r"CartPole-v1, ppo, seed 5: there is no"):
-        verdicts.ledger(frame[~own], study.metrics, PAPERS)
+        verdicts.ledger(frame[~own], STUDY.metrics, PAPERS)
 
 
-def test_a_part_without_a_test_counts_where_all_are_corrected(study: Study) -> None:
+def test_a_part_without_a_test_counts_where_all_are_corrected() -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     one_seed = frame[(frame["env"] != "HopperBulletEnv-v0") | (frame["seed"] == 0)]
     # By 2 of 2¹² sign patterns, as in most others; of 24 only C8's two parts have smaller p values.
-    found = [part.p_holm for part in found_of(one_seed, study, "C1")]
+    found = [part.p_holm for part in found_of(one_seed, "C1")]
     assert found == pytest.approx([22 * 2 / 2**12] * 2)
 
 
-def test_variants_of_different_budgets_are_compared_within_the_shorter(study: Study) -> None:
+def test_variants_of_different_budgets_are_compared_within_the_shorter() -> None:
     """What neither reaches is no difference, and what a third variant has does not matter."""
     frame = table_for_claims(12, EQUAL, noise=0.0)
     for variant, budget in (("ppo", 4000), ("mace_full", 2000), ("mace_fixed", 500)):
         own = (frame["env"] == "CartPole-v1") & (frame["variant"] == variant)
         frame.loc[own, ["episodes", "sample_efficiency_common"]] = budget  # never reached
-    over_ppo, over_fixed = found_of(frame, study, "C5")
+    over_ppo, over_fixed = found_of(frame, "C5")
     assert (over_ppo.difference, over_ppo.probability) == (0, 0.5)
     assert (over_ppo.worth_mentioning, over_fixed.worth_mentioning) == (100, 25)
 
 
 def test_a_mean_over_environments_weighs_each_alike_whatever_its_scale_and_seeds() -> None:
     """Q7: three tasks, of which one has more seeds."""
-    settings = QUESTIONED
     frame = table_for_questions(30, mace_full=0.3)
     frame = frame[(frame["env"] == "BarrenRegion-v0") | (frame["seed"] < 12)]
-    found = verdicts.ledger(frame, settings, QUESTIONS)
+    found = verdicts.ledger(frame, QUESTIONED, QUESTIONS)
     (part,) = next(one for one in found if one.claim == "Q7").ways[ROBUST].parts
     areas = frame.set_index(["env", "variant", "seed"])["area_under_curve"].sort_index()
     expected = [
         (areas[env, "mace_full"] - areas[env, "mace_no_memory"]).mean()
-        / (settings.reference_return[env] - settings.random_return[env])
+        / (QUESTIONED.reference_return[env] - QUESTIONED.random_return[env])
         for env in ("BarrenRegion-v0", "NoisyMountainCar-v0", "NoisyDeepSea10-v0")
     ]
     assert part.difference == pytest.approx(np.mean(expected))
@@ -233,36 +227,31 @@ def test_the_ledger_is_read_as_it_was_written(tmp_path: Path, claims: ClaimsConf
 )
 def test_a_part_has_direction_and_size(interval, p_holm, p_equivalent_holm, expected, changes):
     """The margin is 5, and p values that are not corrected say nothing."""
-    finding = SizedFinding(
-        *(("CartPole-v1",), "final_return", "mace_full", "ppo", "return", 10, np.mean(interval)),
-        *(*interval, 0.0001, 0.5, 0.4, 0.6, 1.0, 5.0, np.nan, 0.0001, p_holm, p_equivalent_holm),
-        room=99.0,
-    )
+    given = 10, np.mean(interval), *interval, *FIT, p_holm, p_equivalent_holm
+    finding = SizedFinding(*FOUND, *given, room=99.0)
     found = direction_and_size.decided(replace(finding, **changes))
     assert (found.outcome, found.size, found.replication) == (*expected, "")
 
 
-def test_what_could_not_improve_could_not_be_asked(study: Study) -> None:
+def test_what_could_not_improve_could_not_be_asked() -> None:
     """Acrobot's PPO needs 60 episodes of a possible 50, and ends where the best run does."""
     frame = table_for_claims(12, EQUAL, noise=0.02)
     draws, acrobot = np.random.default_rng(5), frame["env"] == "Acrobot-v1"
     frame.loc[acrobot, "sample_efficiency_common"] = draws.integers(58, 63, acrobot.sum())
     frame.loc[acrobot, "final_return"] = draws.normal(-86, 1, acrobot.sum())
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = verdicts.ledger(frame, settings, BY_SIZE)
+    answers = verdicts.ledger(frame, QUICK, BY_SIZE)
     judged = {one.claim: one.ways[ROBUST] for one in answers}
     assert (judged["C1"].outcome, judged["C1"].verdict) == ("no_room", "could not be asked")
     assert [part.outcome for part in judged["C7"].parts] == ["no_room"] * 2 + ["absent"] * 2
     assert judged["C7"].verdict == "not reproduced"  # for Hopper's sake
     frame.loc[~acrobot, "final_return"] = draws.normal(900, 900, (~acrobot).sum())
-    judged = {one.claim: one for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    judged = {one.claim: one for one in verdicts.ledger(frame, QUICK, BY_SIZE)}
     assert judged["C7"].ways[ROBUST].verdict == "open"
 
 
-def test_margin_room_and_replication_are_what_they_are_by_hand(study: Study) -> None:
+def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
     frame = table_for_claims(12, SMALL, noise=0.1)
-    settings = study.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-    answers = {one.claim: one.ways for one in verdicts.ledger(frame, settings, BY_SIZE)}
+    answers = {one.claim: one.ways for one in verdicts.ledger(frame, QUICK, BY_SIZE)}
     runs = frame.set_index(["env", "variant", "seed"]).sort_index()
     efficiency = runs.loc["Acrobot-v1", "sample_efficiency_common"]
     (part, _), mean = answers["C1"][ROBUST].parts, efficiency["ppo"].mean()
@@ -322,10 +311,9 @@ def test_what_a_study_lacks_for_a_family() -> None:
     for title, family in CLAIMS.families.items():
         parts = [part for _, part in parts_of(family)]
         names = {name for part in parts for name in (*part.environments, part.variant, *part.over)}
-        settings = QUESTIONED
-        assert CLAIMS.lacking(names, names, settings)[title] == []
+        assert CLAIMS.lacking(names, names, QUESTIONED)[title] == []
         for name in names:
-            assert CLAIMS.lacking(names - {name}, names - {name}, settings)[title] == [name]
-        bare = settings.model_copy(update={"reference_return": {}})
+            assert CLAIMS.lacking(names - {name}, names - {name}, QUESTIONED)[title] == [name]
+        bare = QUESTIONED.model_copy(update={"reference_return": {}})
         (first, *_) = CLAIMS.lacking(names, names, bare)[title]
         assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import shlex
 import subprocess
 import sys
@@ -12,7 +13,6 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from shared import GOOD, RESULTS, Bonanza, call, files, refusal
-from snakemake.utils import update_config
 
 from mace_rl import cli
 from mace_rl.config.reading import DEFAULTS
@@ -22,16 +22,16 @@ from mace_rl.study.config import load_study
 
 CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 
-# What is changed in a good command, and what the message has to name.
-MISTAKES = {
-    "variant of a further study": ({"--variant": "beta_0.4"}, ["'beta_0.4'", "--config FILE"]),
-    "seed beyond 32 bits": ({"--seed": "4294967296"}, ["4294967296"]),
-    "no episodes": ({"--episodes": "0"}, ["--episodes", "0", "at least 1"]),
-    "no steps": ({"--max-episode-steps": "0"}, ["--max-episode-steps", "0", "at least 1"]),
-    "config that is not there": ({"--config": "/nonexistent.yaml"}, ["/nonexistent.yaml"]),
-    "config that is a folder": ({"--config": "/"}, ["/"]),
-    "out below a file": ({"--out": f"{__file__}/run"}, ["test_cli.py"]),
-}
+# What is changed in a good command, and what is said.
+MISTAKES = [
+    ({"--variant": "beta_0.4"}, "'beta_0.4'.*--config FILE"),  # of a further study
+    ({"--seed": "4294967296"}, "4294967296"),
+    ({"--episodes": "0"}, "--episodes.* 0.*at least 1"),
+    ({"--max-episode-steps": "0"}, "--max-episode-steps.* 0.*at least 1"),
+    ({"--config": "/nonexistent.yaml"}, "/nonexistent.yaml"),
+    ({"--config": "/"}, "/"),
+    ({"--out": f"{__file__}/run"}, "test_cli.py"),
+]
 # Mistakes in the form of the command, which argparse answers with the usage and its reason.
 MALFORMED = [
     [],
@@ -44,31 +44,15 @@ MALFORMED = [
 ]
 
 
-def refused(monkeypatch, options: dict[str, str], expected: list[str]) -> None:
+def refused(monkeypatch, options: dict[str, str], pattern: str) -> None:
     said = refusal(monkeypatch, "train", *sum(options.items(), ()))
-    assert said.startswith("mace-rl: ")
-    assert [fragment for fragment in expected if fragment not in said] == []
+    assert re.search(f"^mace-rl: .*{pattern}", said)
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_gets_one_line(name, monkeypatch, tmp_path):
-    change, expected = MISTAKES[name]
-    refused(monkeypatch, GOOD | {"--out": str(tmp_path / "run")} | change, expected)
+@pytest.mark.parametrize(("change", "pattern"), MISTAKES)
+def test_a_mistake_gets_one_line(monkeypatch, tmp_path, change, pattern):
+    refused(monkeypatch, GOOD | {"--out": str(tmp_path / "run")} | change, pattern)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("order", [("planted", "questions"), ("questions", "planted")])
-def test_runs_of_combined_studies_are_those_of_the_workflow(order):
-    """As Snakemake's own function reads the files over each other."""
-    paths = [DEFAULTS.parent / "config" / f"{name}.yaml" for name in order]
-    merged = json.loads(json.dumps(CONFIG))
-    for path in paths:
-        update_config(merged, yaml.safe_load(path.read_text(encoding="utf-8")))
-    expected = load_study(merged, "some.yaml").run_config("DeepSea10-v0", "beta_0.4", 0)
-    options = GOOD | {"--env": "DeepSea10-v0", "--variant": "beta_0.4", "--out": "x"}
-    words = ["train", *sum(options.items(), ()), "--config", str(paths[0]), "--config"]
-    found = cli.run_config(cli.parser().parse_args([*words, str(paths[1])]))
-    assert found == expected.model_copy(update={"episodes": 3})
 
 
 @pytest.mark.parametrize("words", MALFORMED, ids=" ".join)
@@ -144,8 +128,8 @@ def test_a_run_by_hand_then_as_another_then_again(monkeypatch, tmp_path, caplog)
         ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),
         ("--config", str(steps), "config.max_episode_steps was None and is 9"),
     ):
-        named = [str(out), "choose another folder, or set this run aside: --restart", difference]
-        refused(monkeypatch, options | {option: value}, named)
+        way_out = "choose another folder, or set this run aside: --restart"
+        refused(monkeypatch, options | {option: value}, f"{out}.*{difference}.*{way_out}")
     assert not caplog.text  # neither trained nor called finished
     assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
     assert "finished" in caplog.text

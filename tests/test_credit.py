@@ -18,8 +18,6 @@ from mace_rl.numerics.adam import Adam
 from mace_rl.numerics.network import CompiledMLP, mlp
 from mace_rl.trainer import Trainer
 
-# --- The meta gradient --------------------------------------------------------------------------
-
 
 class SmallProblem:
     """One decision in each of three states: J and its gradient are exact sums over 3 × 2 cases.
@@ -87,9 +85,6 @@ def test_credit_is_the_derivative_of_the_next_policy_s_return(run_config, seed, 
     assert 1e-2 * 0.1 * after @ direction == pytest.approx(measured, rel=0.02, abs=1e-7)
 
 
-# --- Which β is credited with what --------------------------------------------------------------
-
-
 class Watched(Trainer):
     """Keeps, round by round, what was played, by which weights, and what β does in the update."""
 
@@ -108,8 +103,6 @@ class Watched(Trainer):
 
 
 class Round(NamedTuple):
-    """One round of training."""
-
     rollout: list[Experience]
     policy: np.ndarray  # the parameters that played it
     unit: np.ndarray  # √v̂ + ε of the actor's optimiser before the update; test_ppo.py has it

@@ -182,32 +182,3 @@ def test_the_outcome_of_a_chain_of_10_steps_is_remembered(make):
     assert found.similarity == pytest.approx([1, 1])
     worse = ((worst + best) / 2 - recalled) / ((best - worst) / 2)
     assert found.relevance == pytest.approx([1 - worse, 1], rel=1e-4) and worse > 0.9
-
-
-@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
-def test_restored_curiosity_continues_to_the_bit(make, name):
-    """Also what waits for the next refresh, and between two states that are written."""
-    novelty = {"write_every": 4, "refresh_every": 100, "buffer_size": 20, "neighbours": [3]}
-    every_fourth = {"memory": {"write_every": 4}, "novelty": novelty}
-    original, restored = make(name, **every_fourth), make(name, **every_fourth)
-    rng = np.random.default_rng(0)
-
-    def episode() -> Episode:
-        if name == "CartPole-v1":
-            return wander(int(rng.integers(1000)))
-        return episode_of(np.eye(16)[rng.integers(16, size=31)])
-
-    for _ in range(5):
-        original.bonus(played := episode())
-        original.remember(played, rng.standard_normal(30))
-    original.bonus(episode())  # what it has read counts as used when one is remembered
-    restored.load_state_dict(copy.deepcopy(original.state_dict()))
-    if name == "CartPole-v1":
-        assert (restored.novelty.seen, len(restored.novelty.waiting)) == (20, 8)
-    for _ in range(4):
-        played, returns = episode(), rng.standard_normal(30)
-        np.testing.assert_equal(original.bonus(played), restored.bonus(played))
-        original.remember(played, returns)
-        restored.remember(played, returns)
-    assert (original.memory.usage == restored.memory.usage).all()
-    assert (original.memory.values == restored.memory.values).all()

@@ -1,8 +1,10 @@
-"""Pages: the examples of docs/extending.md, run from an empty folder as they stand; links."""
+"""Pages: the examples of docs/extending.md and docs/wrappers.md as they stand, examples/; links."""
 
 import json
 import re
+import runpy
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -95,19 +97,6 @@ def test_the_example_s_state_is_saved(folder, kill, checkpoint_every, completes)
     assert completes(config, folder / "killed")["interruptions"][0]["environment_replayed"]
 
 
-def test_edit_of_the_user_s_file_makes_it_another_run(folder, train):
-    assert train("linear_decay") == (0, "")
-    record = folder / "linear_decay" / "run.json"
-    before = json.loads(record.read_text(encoding="utf-8"))["sources"]
-    with (folder / "linear_decay.py").open("a", encoding="utf-8") as file:
-        file.write("\n# edited\n")
-    code, said = train("linear_decay")
-    assert code == 1 and "holds a finished run of other code, in linear_decay:" in said
-    record.unlink()
-    assert train("linear_decay") == (0, "")
-    assert json.loads(record.read_text(encoding="utf-8"))["sources"] != before
-
-
 def test_example_metric(folder):
     metrics = read_study([ROOT / "config.yaml", folder / "to_100.yaml"]).metrics
     *_, metric = all_metrics(metrics)
@@ -161,6 +150,78 @@ def test_mistakes_get_one_line(folder, monkeypatch, file, old, new, message):
     name = Path(file).stem
     assert message in refusal(monkeypatch, *shlex.split(TRAININGS[name]))
     assert not (folder / name / "episodes.csv").exists()
+
+
+# --- examples/ and docs/wrappers.md ---------------------------------------------------------------
+
+EXAMPLE = ROOT / "examples" / "sb3_ppo.py"
+
+
+def sb3_ppo(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(EXAMPLE), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_prints_a_row_for_each_seed_and_what_came_out():
+    done = sb3_ppo("--seeds", "2", "--first-seed", "1000", "--steps", "256")
+    assert done.returncode == 0, done.stderr
+    rows = re.findall(r"(?m)^\| (\w+) \|(?:[^|]+\|){4}$", done.stdout)
+    assert rows == ["seed", "1000", "1001", "mean"]
+    assert "with curiosity minus without, last tenth: " in done.stdout
+
+
+@pytest.mark.slow
+def test_help_and_mistakes(monkeypatch, capsys):
+    main = runpy.run_path(str(EXAMPLE))["main"]
+
+    def refused(*words: str) -> str:
+        """What it exits with, in place of its work, or the last line that it printed."""
+        monkeypatch.setattr(sys, "argv", [str(EXAMPLE), *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = "".join(capsys.readouterr())
+        return ended.value.code if isinstance(ended.value.code, str) else said.splitlines()[-1]
+
+    assert refused("--help").startswith("example: python examples/sb3_ppo.py")
+    for option, value, least in (("--seeds", 0, 1), ("--steps", -5, 1), ("--first-seed", -1, 0)):
+        expected = f"{option} is {value}, but should be at least {least}"
+        assert refused(option, str(value)).endswith(expected)
+    for name in ("Foo", "CartPole-v9", "nope:Foo-v0"):
+        line = refused("--environment", name)
+        assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")
+        assert "\n" not in line
+    few = refused("--environment", "Acrobot-v1", "--steps", "1", "--seeds", "1")
+    assert few == "sb3_ppo: no episode ended in --steps 1: give more"
+
+
+@pytest.mark.slow
+def test_curiosity_changes_the_policy_and_not_what_is_counted():
+    train = runpy.run_path(str(EXAMPLE))["train"]
+    without, with_curiosity = (train("DeepSea10-v0", curious, 1000, 1536) for curious in (0, 1))
+    own = {*np.round(-0.001 * np.arange(11), 6), 0.99}  # Deep Sea's own returns, without a bonus
+    for returns in (without, with_curiosity):
+        assert len(returns) >= 153 and set(np.round(returns, 6)) <= own
+    assert (without[:25] == with_curiosity[:25]).all()  # until the first update, after 256 steps
+    assert (without != with_curiosity).any()
+
+
+@pytest.mark.slow
+def test_what_the_page_shows_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "wrappers.md").read_text(encoding="utf-8")
+    assert text.count("learn(10_000)") == 1
+    text = text.replace("learn(10_000)", "learn(1)")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 3
+    names = {}
+    for block in blocks:
+        exec(block, names)
+        env = names["env"]
+        assert len(env.tracker.curiosity.memory) > 0  # the restored one's, too
+    names["shared"].reset()
+    assert names["shared"].step(np.arange(4))[1].shape == (4,)
+    names["agent"].learn(1)
 
 
 # --- Links ----------------------------------------------------------------------------------------

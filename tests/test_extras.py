@@ -18,9 +18,10 @@ from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.finite import NonFiniteError
+from mace_rl.refusal import Refusal
+from mace_rl.runs import run
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.runs.provenance import identity
 from mace_rl.study.config import read_study
 from mace_rl.trainer import Trainer
 from mace_rl.wrappers import CuriosityReward
@@ -58,14 +59,16 @@ def test_the_page_names_every_plugin_and_readers_want_leave(trained, monkeypatch
 
 def test_a_package_counts_as_a_whole(run_config, tmp_path, monkeypatch):
     (tmp_path / "own").mkdir()
-    for name in ("__init__", "rule", "shared_part"):
+    for name in ("__init__", "shared_part"):
         (tmp_path / "own" / f"{name}.py").touch()
-    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own/rule.py").write_text("from test_extras import Noted as Rule")
+    monkeypatch.syspath_prepend(tmp_path)
     beta = {"kind": "custom", "rule": "own.rule:Rule"}
-    config = run_config("CartPole-v1", "mace_fixed", beta=beta)
-    before = identity(config)["sources"]
+    config = run_config("CartPole-v1", "mace_fixed", beta=beta, episodes=1)
+    run.run(config, tmp_path / "run")
     (tmp_path / "own" / "shared_part.py").write_text("x = 1\n")
-    assert identity(config)["sources"] != before
+    with refused(Refusal, r"holds a finished run of other code, in own\.rule:Rule"):
+        run.run(config, tmp_path / "run")
 
 
 def test_a_rule_is_told_when_the_policy_changes(run_config):
@@ -193,7 +196,6 @@ class Everything(FlagNovelty):
 
 
 def test_a_rule_of_the_user_s_own_sees_whole_episodes():
-    """In the wrapper."""
     env = CuriosityReward(gymnasium.make("Pendulum-v1"), RULE)
     found = play(env, 450)
     (first, bonus), (second, _) = env.tracker.controller.shown

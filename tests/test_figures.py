@@ -24,8 +24,6 @@ from mace_rl.records import RecordError
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.statistics import mean_interval
 from mace_rl.study.compare.verdicts import ledger
-from mace_rl.study.config import Study
-from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
 from mace_rl.study.show import curves as c
 from mace_rl.study.show.pictures import PICTURES, Source
@@ -165,7 +163,6 @@ def test_an_inset_shows_a_beginning_in_which_most_is_learned():
 # --- Pictures of all runs at once -----------------------------------------------------------------
 
 CONSTANTS = ["beta_1", "ppo"]
-NAMES = {metric.name: metric.label for metric in all_metrics(QUESTIONED)}
 
 
 @pytest.fixture(scope="module")
@@ -187,9 +184,9 @@ def ledgers() -> list[list[Answer]]:
 
 
 @pytest.fixture
-def settings(study: Study) -> MetricsConfig:
+def settings() -> MetricsConfig:
     chosen = ConstantsConfig(learned="mace_full", fixed=CONSTANTS)
-    return study.metrics.model_copy(update={"constants": chosen, "bootstrap_repetitions": 500})
+    return STUDY.metrics.model_copy(update={"constants": chosen, "bootstrap_repetitions": 500})
 
 
 def test_every_run_is_there_with_its_returns(runs, settings) -> None:
@@ -247,10 +244,11 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
     ("name", "family"),
     [("every_seed", 0), ("constants", 0), ("solved", 0), *(("forest", i) for i in range(3))],
 )
-def test_every_picture_is_the_same_again(runs, ledgers, settings, study, tmp_path, name, family):
+def test_every_picture_is_the_same_again(runs, ledgers, settings, tmp_path, name, family):
     source = Source({"metrics": runs}, ledgers[family], settings, CLAIMS)
     names = dict.fromkeys(runs["variant"], "A label (of some length)") | {"beta_1": "β = 1"}
-    look = c.PlotStyle(study.figure, 0.95, names, dict.fromkeys(names, "tab:blue"), NAMES)
+    colours = dict.fromkeys(names, "tab:blue")
+    look = c.plot_style(QUESTIONED, STUDY.figure.model_dump(), names, colours)
     table = PICTURES[name].data(source)
     table.to_csv(tmp_path / "table.csv", index=False)
     read = pd.read_csv(tmp_path / "table.csv", keep_default_na=False, na_values=[""])

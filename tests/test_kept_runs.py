@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from invented import episode_columns
 from shared import message
 
 from mace_rl import files
@@ -20,17 +21,11 @@ from tools import kept_runs
 
 def make_run(folder: Path, number: int, agent: bytes = b"agent", episodes: int = 30) -> None:
     folder.mkdir(parents=True)
-    rng = np.random.default_rng(number)
-    length = rng.integers(1, 500, episodes)
-    columns = {
-        "episode": np.arange(1, episodes + 1),
-        "env_steps": np.cumsum(length),
-        "length": length,
-        "extrinsic_return": rng.normal(size=episodes) if number % 2 else -length.astype(float),
-        "intrinsic_return": np.array([rounded(x) for x in rng.exponential(size=episodes)]),
-        "beta": np.array([rounded(x) for x in rng.uniform(size=episodes) ** 20]),
-        "terminated": rng.integers(0, 2, episodes),
-    }
+    columns = episode_columns(episodes, number)
+    for name in ("intrinsic_return", "beta"):
+        columns[name] = np.array([rounded(value) for value in columns[name]])
+    if number % 2 == 0:
+        columns["extrinsic_return"] = -columns["length"].astype(float)
     write_episodes(folder / files.EPISODES, columns)
     (folder / files.AGENT).write_bytes(agent)
     digests = {name: file_digest(folder / name) for name in (files.EPISODES, files.AGENT)}

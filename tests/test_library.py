@@ -63,10 +63,11 @@ def test_each_name_is_what_its_module_has_and_no_other_is_there():
 
 def test_settings_are_the_study_s_but_for_what_is_given(run_config, tmp_path):
     assert DEFAULTS == ROOT / "config.yaml"  # not a copy, which edits would not reach
-    file = tmp_path / "own.yaml"
-    file.write_text("variant_settings: {low: {beta: {kind: constant, value: 0.1}}}")
+    files = [tmp_path / "own.yaml", tmp_path / "over.yaml"]
+    files[0].write_text("variant_settings: {low: {beta: {kind: constant, value: 0.2}}}")
+    files[1].write_text("variant_settings: {low: {beta: {value: 0.1}}}")
     changes = {"episodes": 7, "ppo": {"clip": 0.1}}
-    found = settings("CartPole-v1", "low", seed=np.int64(3), config=file, **changes)
+    found = settings("CartPole-v1", "low", seed=np.int64(3), config=files, **changes)
     expected = run_config(seed=3, variant="mace_fixed", **changes).settings()
     beta = {"kind": "constant", "value": 0.1}
     assert found.settings() == expected | {"variant": "low", "beta": beta}

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.config.bonus import MemoryConfig
-from mace_rl.numerics.nearest import Neighbours
 
 ORIGIN, UNIT = np.zeros(3), np.ones(3)  # the identity as an embedding
 
@@ -24,36 +23,6 @@ def experiences(count, seed=0, key_size=3) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     shapes = [(count, key_size), (count, key_size), (count,), (count,)]
     return [rng.standard_normal(shape).astype(np.float32) for shape in shapes]
-
-
-# --- Nearest neighbours -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("size", "total"), [(1, 30), (4, 500), (15, 2000)])
-@pytest.mark.parametrize("centre", [0, 1000])
-def test_nearest_equals_a_full_sort(size, total, centre):
-    """Also far from the origin, at positions like 1000 ± 0.01: the mean goes before the scale.
-
-    A query that is NaN is at no distance from anything, and disturbs no other.
-    """
-    rng = np.random.default_rng(0)
-    spread = np.array([0.01, 2, 1] * 5)[:size]
-    points, queries = (
-        (centre + spread * rng.standard_normal((count, size))).astype(np.float32)
-        for count in (total, 25)
-    )
-    queries = np.append(queries, queries[:1] * np.float32(np.nan), axis=0)
-    mean, std = points.mean(0, dtype=np.float64), points.std(0, dtype=np.float64)
-    squares, indices = Neighbours(points, mean, std).nearest(queries, 20)
-    assert np.isnan(squares[25]).all() and ((indices >= 0) & (indices < total)).all()
-    exact = (((queries[:25, None].astype(np.float64) - points[None]) / std) ** 2).sum(2)
-    expected = np.sort(exact, axis=1)[:, :20]
-    np.testing.assert_allclose(squares[:25], expected, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(np.take_along_axis(exact, indices[:25], 1), expected, rtol=1e-4)
-    assert all(len(set(row)) == 20 for row in indices.tolist())
-
-
-# --- Recalling ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stored", [1, 3, 40])
@@ -94,9 +63,6 @@ def test_what_cannot_be_recalled():
         memory.recall(state)
     memory.build_index(ORIGIN, UNIT)
     assert np.isnan(memory.recall(state + np.float32(1e25))[0]).all()
-
-
-# --- Replacement --------------------------------------------------------------------------------
 
 
 class ListOfSlots:

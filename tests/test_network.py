@@ -18,8 +18,6 @@ from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 
-# --- Compiled networks --------------------------------------------------------------------------
-
 # Compiled form, torch module from a generator, shape of the inputs.
 CASES = []
 for hidden in ([1], [5], [64, 64], [3, 4, 5]):
@@ -86,17 +84,6 @@ def test_parameters_in_another_precision_are_refused():
         compiled.move_to(np.zeros(len(compiled.parameters)))
 
 
-@pytest.mark.parametrize("hidden", [[1], [5, 17], [64, 64]])
-def test_the_forward_pass_of_one_observation_is_that_of_many_to_the_bit(hidden):
-    rng = np.random.default_rng(0)
-    one = CompiledMLP(mlp([6, *hidden, 3], 1.0, rng))
-    inputs = drawn(rng, (70, 6))
-    together = one.forward(inputs).outputs
-    assert len(np.unique(together)) > 200
-    for row, outputs in zip(inputs, together, strict=True):
-        assert (one.forward(row[None]).outputs[0] == outputs).all()
-
-
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
 @pytest.mark.parametrize("output_gain", [0.01, 1.0])
 def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
@@ -108,9 +95,6 @@ def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
         expected = gain**2 * np.eye(len(small))
         np.testing.assert_allclose(small @ small.T, expected, atol=1e-6 * gain**2)
         assert (layer.bias == 0).all()
-
-
-# --- The meta network ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [1, 40])
@@ -150,9 +134,6 @@ def test_a_permutation_is_uniform_if_the_draws_are():
     assert found.tolist() == sorted(map(list, permutations(range(4))))
     assert (counts == 12**3 / 24).all()
     assert (shuffled(np.ones((2, 5))) == np.arange(5)).all()
-
-
-# --- Any torch module ---------------------------------------------------------------------------
 
 
 class Normalised(torch.nn.Sequential):

@@ -201,9 +201,6 @@ def test_states_that_repeat_exactly_are_known(cells):
     assert novelty(grid).mean() < 0.2
 
 
-# --- The density estimator ------------------------------------------------------------------------
-
-
 def arbitrary(size, hidden_units) -> DensityEstimator:
     generator = np.random.default_rng(0)
     model = DensityEstimator(size, hidden_units, generator)

@@ -127,8 +127,9 @@ def test_box_actions_are_mean_plus_std_times_noise(engine):
 
 
 @both_spaces
-def test_acting_has_the_bits_of_the_batch(space):
-    policy = random_policy(space, hidden=(64, 64), scale=0.4)
+@pytest.mark.parametrize("hidden", [[1], [5, 17], [64, 64]])
+def test_acting_has_the_bits_of_the_batch(space, hidden):
+    policy = random_policy(space, hidden=hidden, scale=0.4)
     observations, _ = steps(policy, 100)
     rng = np.random.default_rng(8)
     noise = rng.random(100) if policy.discrete else rng.standard_normal((100, 3))

@@ -1,4 +1,4 @@
-"""The same bytes whatever a process is told of threads, hashes, language and time, as before."""
+"""The same bytes whatever a process is told of threads, language, time and its processor."""
 
 import os
 import subprocess
@@ -8,18 +8,28 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from invented import CLAIMS
+from numba.core.registry import cpu_target
 from shared import ROOT, VARIANTS, finish, provenance_of
 
 from mace_rl.records import EpisodeRecord, RunKey, as_columns
 from mace_rl.study.compare.summary import split, summary
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.measure.metrics import metrics_table
 from mace_rl.study.show import curves
 from mace_rl.study.show.latex import table1_latex
 
+PRODUCTS = f"{Path(__file__).with_name('test_products.py')}::test_every_element_is_one_chain"
+HAS_AVX512 = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
 STRANGE = {"PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 STRANGE |= {"LC_ALL": "C", "LANG": "tr_TR.UTF-8", "TZ": "Asia/Kathmandu"}
 STRANGE |= {"SOURCE_DATE_EPOCH": "1", "MPLBACKEND": "svg"}
+
+AVX512 = "+avx512f,+avx512vl,+avx512dq,+avx512bw,+avx512cd,+avx2,+fma,+bmi,+bmi2"
+TARGETS = {  # of numba's compiler
+    "haswell": "+avx2,+fma,+bmi,+bmi2,+f16c,+lzcnt,+popcnt,+movbe",
+    "skylake-avx512": AVX512,
+    "znver5": AVX512,
+}
 
 TRAIN = """
 import sys
@@ -31,26 +41,30 @@ run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]))
 """
 
 
-def start(*command: str, strange: bool) -> None:
+def start(*command: str, **told: str) -> None:
     plain = {name: value for name, value in os.environ.items() if name not in STRANGE}
-    environment = plain | (STRANGE if strange else {})
-    subprocess.run([sys.executable, *command], env=environment, check=True)
+    subprocess.run([sys.executable, *command], env=plain | told, check=True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0"])
 def test_a_training_is_the_same(run_config, tmp_path: Path, environment: str) -> None:
-    config = run_config(environment, "mace_full", 0, episodes=30).model_dump_json()
-    for name in ("plain", "strange"):
-        start("-c", TRAIN, config, str(tmp_path / name), strange=name == "strange")
-    one, other = (provenance_of(tmp_path / name)["outputs"] for name in ("plain", "strange"))
-    assert one == other
+    config = run_config(environment, "mace_full", 0, episodes=40).model_dump_json()
+    told = {"plain": {}, "strange": STRANGE}
+    for name, features in TARGETS.items() if environment == "CartPole-v1" else ():
+        if features != AVX512 or HAS_AVX512:
+            told[name] = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features}
+            start("-m", "pytest", "-q", PRODUCTS, **told[name])
+    for name, given in told.items():
+        start("-c", TRAIN, config, str(tmp_path / name), **given)
+    outputs = [provenance_of(tmp_path / name)["outputs"] for name in told]
+    assert outputs == outputs[:1] * len(told)
 
 
 @pytest.mark.slow
 def test_tables_and_figures_are_the_same() -> None:
     tests = [f"{__file__}::{name}" for name in ("test_table_1", "test_figures")]
-    start("-m", "pytest", "-q", *tests, strange=True)
+    start("-m", "pytest", "-q", *tests, **STRANGE)
 
 
 # --- docs/reduced ---------------------------------------------------------------------------------
@@ -78,9 +92,9 @@ def test_table_1(runs):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_figures(runs, tmp_path, number):
-    shown, confidence = curves.quantity(number, STUDY.metrics), STUDY.metrics.confidence
+    shown, layout = curves.quantity(number, STUDY.metrics), STUDY.figure.model_dump()
     single = curves.seed_curves(runs, shown)
-    look = curves.PlotStyle(STUDY.figure, confidence, STUDY.labels, STUDY.colours, {})
+    look = curves.plot_style(METRICS, layout, STUDY.labels, STUDY.colours)
     means = curves.mean_curves(single, shown, STUDY.metrics)
     name = f"figure{number}.png"
     curves.save_figure(curves.draw_figure(means, single, shown, look), tmp_path / name)

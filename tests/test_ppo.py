@@ -13,10 +13,8 @@ from mace_rl.agent.ppo import PPO
 from mace_rl.numerics.adam import Adam
 from mace_rl.streams import Streams
 
-ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1"]  # Discrete and Box actions
-
-both_engines = pytest.mark.parametrize("engine", ENGINES)
-both_environments = pytest.mark.parametrize("environment", ENVIRONMENTS)
+# With Discrete and Box actions.
+both_environments = pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])
 
 
 def networks(ppo: PPO) -> dict[str, Twin]:
@@ -54,7 +52,7 @@ def surrogate(
     return torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean(), ratio
 
 
-@both_engines
+@pytest.mark.parametrize("engine", ENGINES)
 @both_environments
 def test_policy_gradients_equal_autograd(make_ppo, environment, engine):
     ppo = make_ppo(environment, engine=engine)

@@ -14,7 +14,7 @@ from mace_rl import files
 from mace_rl.study.claims_config import parse_claims, read_claims
 from mace_rl.study.compare.verdicts import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING
 from mace_rl.study.config import Study, read_study
-from mace_rl.study.measure.metrics import BEFORE, CORRELATION
+from mace_rl.study.measure.betas import BEFORE, CORRELATION
 from tools import kept_runs
 
 CONFIRMATION = ROOT / "reference" / "confirmation"

@@ -3,13 +3,11 @@
 import copy
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import patch
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from shared import OUTCOME
 from torch.nn import functional
 
 from mace_rl import published
@@ -124,27 +122,24 @@ def test_each_named_setting_changes_a_result(monkeypatch, world, section, name):
 
 
 @pytest.mark.parametrize("environment", ["CartPole-v1", BOX])
-def test_it_resumes_and_repeats_to_the_bit(tmp_path, monkeypatch, environment):
+def test_it_resumes_and_repeats_to_the_bit(
+    tmp_path, monkeypatch, checkpoint_every, completes, environment
+):
     monkeypatch.setattr(published, "CAPACITY", 20)
-    config = make(environment, published={"novelty_buffer_fills": True})
-    run.run(config, tmp_path / "whole")
+    monkeypatch.setattr(run, "OBSERVER_SECONDS", 0.0)
+    config, folder = make(environment, published={"novelty_buffer_fills": True}), tmp_path / "run"
 
     def interrupt(progress):
         if progress["episode"] == 2:
             raise KeyboardInterrupt
 
-    often = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "OBSERVER_SECONDS": 0.0}
-    with patch.multiple(run, **often), pytest.raises(KeyboardInterrupt):
-        run.run(config, tmp_path / "resumed", interrupt)
-    assert (tmp_path / "resumed" / "checkpoint.pt").exists()
-    run.run(config, tmp_path / "resumed")
-    for name in OUTCOME:
-        whole, resumed = (tmp_path / folder / name for folder in ("whole", "resumed"))
-        assert whole.read_bytes() == resumed.read_bytes()
-    then = FinishedRun(tmp_path / "resumed")
-    assert then.record["interruptions"][0]["environment_replayed"]
-    assert repeat(then)[0]
-    first, again = (evaluate(tmp_path / "whole", 2, 7) for _ in range(2))
+    checkpoint_every(1)
+    with pytest.raises(KeyboardInterrupt):
+        run.run(config, folder, interrupt)
+    (interruption,) = completes(config, folder)["interruptions"]
+    assert interruption["after_episode"] > 0 and interruption["environment_replayed"]
+    assert repeat(FinishedRun(folder))[0]
+    first, again = (evaluate(folder, 2, 7) for _ in range(2))
     assert first.tolist() == again.tolist()
 
 

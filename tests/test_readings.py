@@ -3,24 +3,18 @@
 import numpy as np
 import pandas as pd
 import pytest
-from invented import CLAIMS
+from invented import CLAIMS, STUDY, frame
 
 from mace_rl.study.compare import readings as r
 from mace_rl.study.compare.statistics import logrank
-from mace_rl.study.config import Study
-from mace_rl.study.measure.metrics import all_metrics
-from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.measure.metrics import metrics_table
 from mace_rl.study.show import tables
-from mace_rl.study.show.curves import PlotStyle
+from mace_rl.study.show.curves import plot_style
 from mace_rl.study.show.markdown import markdown
 from mace_rl.study.show.pictures import PICTURES
 
 EPISODES = 400
 Frames = dict[tuple[str, str, int], pd.DataFrame]
-
-
-def records(returns: np.ndarray) -> pd.DataFrame:
-    return pd.DataFrame({"extrinsic_return": returns, "env_steps": np.cumsum(returns)})
 
 
 @pytest.fixture
@@ -31,7 +25,7 @@ def frames() -> Frames:
         for variant, knee in (("ppo", 240), ("mace_fixed", 200), ("mace_full", 100)):
             level = np.interp(np.arange(EPISODES), [0, knee, EPISODES], [20, 450, 450])
             returns = np.clip(level + rng.normal(0, 20, EPISODES), 9, 500).round()
-            found["CartPole-v1", variant, seed] = records(returns)
+            found["CartPole-v1", variant, seed] = frame(returns)
     return found
 
 
@@ -40,9 +34,9 @@ def select(table: pd.DataFrame, reading: str, source: str) -> pd.DataFrame:
     return rows.set_index("variant")
 
 
-def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames, study: Study) -> None:
-    table = r.readings(frames, study.metrics, CLAIMS.table1)
-    runs = metrics_table(frames, study.metrics)
+def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames) -> None:
+    table = r.readings(frames, STUDY.metrics, CLAIMS.table1)
+    runs = metrics_table(frames, STUDY.metrics)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     expected = runs.groupby("variant")["sample_efficiency_range"].mean()
     assert rows["mean"].to_dict() == pytest.approx(expected.to_dict())
@@ -55,13 +49,13 @@ def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames, study: St
     published = {"ppo": 660, "mace_fixed": 620, "mace_full": 634}
     assert rows["mean"].to_dict() == published
     assert rows["rank"].to_dict() == {"ppo": 3, "mace_fixed": 1, "mace_full": 2}
-    for run, shuffled in r.shuffled(frames, study.metrics).items():
+    for run, shuffled in r.shuffled(frames, STUDY.metrics).items():
         own, other = frames[run]["extrinsic_return"], shuffled["extrinsic_return"]
         assert sorted(own) == sorted(other) and not np.array_equal(own, other)
     rows = select(table, "sample_efficiency", r.SHUFFLED)
     assert (rows["mean"] < 10).all()  # three in four returns are over the bar
     # The table names the first first, bold if that is no chance; the paper before, noise last.
-    lines = markdown(tables.readings(table, study.metrics)).splitlines()
+    lines = markdown(tables.readings(table, STUDY.metrics)).splitlines()
     (cell,) = [line.split("|")[2] for line in lines if "Sample efficiency (range)" in line]
     assert cell.strip().startswith("**mace_full ")
     order = [part.strip("* ").split()[0] for part in cell.split(",")]
@@ -87,7 +81,7 @@ def test_first_for_sure_is_who_is_ahead_of_every_other(means, p_values, expected
     assert (list(found["variant"]), sure) == (["a", "b", "c"], expected)
 
 
-def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None:
+def test_runs_that_never_got_there_are_censored_at_the_end() -> None:
     """Three of six never do, the others of both variants at the same episodes."""
     frames = {}
     for seed in range(6):
@@ -95,28 +89,27 @@ def test_runs_that_never_got_there_are_censored_at_the_end(study: Study) -> None
             returns = np.full(EPISODES, 20.0)
             if variant == "ppo" or seed < 3:
                 returns[100 + seed :] = 450.0
-            frames["CartPole-v1", variant, seed] = records(returns)
-    table = r.readings(frames, study.metrics, CLAIMS.table1)
+            frames["CartPole-v1", variant, seed] = frame(returns)
+    table = r.readings(frames, STUDY.metrics, CLAIMS.table1)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
-    runs = metrics_table(frames, study.metrics).set_index("variant")
+    runs = metrics_table(frames, STUDY.metrics).set_index("variant")
     times = {name: runs.loc[name, "sample_efficiency_range"].to_numpy(float) for name in rows.index}
     times["mace_full"][3:] = np.inf
     expected = logrank(times["ppo"], times["mace_full"], 9999, np.random.default_rng(0))
     assert rows.loc["mace_full", "p_value"] == pytest.approx(expected)
     assert rows.loc["mace_full", "mean"] == (sum(times["ppo"][:3]) + 3 * EPISODES) / 6
-    cells = markdown(tables.readings(rows.reset_index(), study.metrics)).splitlines()[2]
+    cells = markdown(tables.readings(rows.reset_index(), STUDY.metrics)).splitlines()[2]
     assert "ppo" in cells and f"mace_full {rows.loc['mace_full', 'mean']:.0f}†" in cells
 
 
-def test_an_environment_that_the_paper_has_not(frames: Frames, study: Study) -> None:
+def test_an_environment_that_the_paper_has_not(frames: Frames) -> None:
     changes = {"random_return": {"Other-v0": 20.0}, "reference_return": {}}
-    settings = study.metrics.model_copy(update=changes)
+    settings = STUDY.metrics.model_copy(update=changes)
     other = {("Other-v0", *run[1:]): frame for run, frame in frames.items()}
     table = r.readings(other, settings, CLAIMS.table1)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
-    names = {metric.name: metric.label for metric in all_metrics(settings)}
-    look = PlotStyle(study.figure, 0.95, {name: name for name in colours}, colours, names)
+    look = plot_style(settings, STUDY.figure.model_dump(), STUDY.labels, colours)
     figure = PICTURES["readings"].draw(table, look)
     assert [axes.get_title() for axes in figure.axes] == ["Other-v0"]

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from invented import episode_columns
 from shared import refused
 
 from mace_rl.records import RecordError, read_episodes, write_episodes
@@ -15,20 +16,10 @@ ROWS = ["1,10,10,9.5,0.25,0.4,1", "2,30,20,-19.0,3e-05,0.3996,0", "3,31,1,0.1,0.
 
 
 def columns(episodes=3):
-    """Columns of awkward doubles: subnormal, largest, negative zero, and random mantissas."""
-    generator = np.random.default_rng(0)
-    length = generator.integers(1, 500, episodes)
-    extrinsic = generator.normal(size=episodes) * 10.0 ** generator.integers(-20, 20, episodes)
-    extrinsic[: min(3, episodes)] = [5e-324, np.finfo(float).max, -0.0][:episodes]
-    return {
-        "episode": np.arange(1, episodes + 1),
-        "env_steps": np.cumsum(length),
-        "length": length,
-        "extrinsic_return": extrinsic,
-        "intrinsic_return": generator.random(episodes) / 3,
-        "beta": generator.random(episodes),
-        "terminated": generator.integers(0, 2, episodes),
-    }
+    """Awkward doubles among them: subnormal, largest, negative zero."""
+    found = episode_columns(episodes)
+    found["extrinsic_return"][:3] = 5e-324, np.finfo(float).max, -0.0
+    return found
 
 
 def text(rows=ROWS, header=HEADER):

@@ -23,10 +23,9 @@ from mace_rl.refusal import Refusal
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.study.metrics_config import ConstantsConfig
 from mace_rl.study.show.animations import animations
-from mace_rl.study.show.curves import PlotStyle
+from mace_rl.study.show.curves import plot_style
 from mace_rl.study.show.report import Provenance, three_digits
 from mace_rl.study.show.report import page as build
 from mace_rl.study.show.sections import read_data
@@ -195,8 +194,7 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
     making = Provenance("a command", {}, ppo, records)
     films = animations({("CartPole-v1", v): made / v for v in VARIANTS}, study.labels, made)
-    names = {metric.name: metric.label for metric in all_metrics(settings)}
-    look = PlotStyle(study.figure, settings.confidence, study.labels, study.colours, names)
+    look = plot_style(settings, study.figure.model_dump(), study.labels, study.colours)
     how = CLAIMS, making, films, settings, look
     html = build(data, claims, *how)
     assert html == build(data, claims, *how)

@@ -324,12 +324,6 @@ def test_a_part_that_is_not_of_its_space_is_refused(part):
             spaces.encode(given, 4)
 
 
-def test_tuples_are_flattened():
-    """Blackjack: what the player has, what the dealer shows, an ace; one-hot, in a row."""
-    parts = np.split(play(environment_of("Blackjack-v1", 0, 5)).observations, [32, 32 + 11], axis=1)
-    assert all((part.sum(axis=1) == 1).all() for part in parts)
-
-
 def test_settings_reach_the_environment():
     """max_episode_steps goes before its own; without slipping an action leads where it points."""
     for name, own in (("CliffWalking-v1", None), ("CartPole-v1", 500)):

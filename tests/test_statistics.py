@@ -8,12 +8,11 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from invented import SEEDS, STUDY, expanded, table_for_scores, table_for_tables
+from invented import QUICK, SEEDS, STUDY, expanded, table_for_scores, table_for_tables
 
 from mace_rl.study.compare import aggregate as a
 from mace_rl.study.compare import statistics as s
 from mace_rl.study.compare.comparisons import comparisons
-from mace_rl.study.config import Study
 from mace_rl.study.measure.metrics import all_metrics
 
 REPETITIONS = 5000
@@ -188,24 +187,20 @@ def test_logrank_of_many_runs_is_near_scipys_approximation():
     assert np.isnan(s.logrank(x[:1], y[:1], 999, generator()))
 
 
-# --- Comparisons and scores -----------------------------------------------------------------------
-
-FEW = {"bootstrap_repetitions": 1000, "bootstrap_seed": 0}
-SETTINGS = STUDY.metrics.model_copy(update=FEW)
-METRICS = all_metrics(SETTINGS)
+METRICS = all_metrics(QUICK)
 metrics = partial(table_for_tables, METRICS)
 UNITS = {metric.name: metric.unit for metric in METRICS}
 COMPARED = 0.95, 1000
 
 
 def test_which_pairs_are_compared_where():
-    frame = comparisons(metrics(variants=["ppo", "mace_full"]), SETTINGS)
+    frame = comparisons(metrics(variants=["ppo", "mace_full"]), QUICK)
     assert set(zip(frame["variant"], frame["baseline"], strict=True)) == {("mace_full", "ppo")}
-    frame = comparisons(metrics(variants=["ppo"]), SETTINGS)
+    frame = comparisons(metrics(variants=["ppo"]), QUICK)
     assert frame.empty and "p_holm" in frame
-    alone = comparisons(metrics(["CartPole-v1"]), SETTINGS)  # not repeated as all environments
+    alone = comparisons(metrics(["CartPole-v1"]), QUICK)  # not repeated as all environments
     assert set(alone["env"]) == {"CartPole-v1"}
-    frame = comparisons(metrics(seeds=1), SETTINGS)  # has differences and no p values
+    frame = comparisons(metrics(seeds=1), QUICK)  # has differences and no p values
     assert frame[["low", "high", "p_value", "p_holm", "probability_low"]].isna().all(axis=None)
     assert frame["probability"].notna().all()
     assert frame.loc[frame["env"] != "all", "difference"].notna().all()
@@ -216,7 +211,7 @@ def test_comparisons_of_pairs():
     returns = {"ppo": range(9), "mace_fixed": range(40, 58, 2), "mace_full": [4] * 9}
     frame = metrics(["CartPole-v1", "Acrobot-v1"], seeds=9, final_return=returns)
     shuffled = frame.sample(frac=1, random_state=0)  # pairs are those of a seed, in any order
-    result = comparisons(shuffled, SETTINGS)
+    result = comparisons(shuffled, QUICK)
     assert len(result) == 3 * len(METRICS) * 3
     together = result[result["env"] == "all"]
     result = result.drop(together.index)
@@ -267,7 +262,7 @@ def test_censoring_is_respected(budgets):
     values = {"sample_efficiency": times, "sample_efficiency_censored": flags}
     values["episodes"] = {name: [ends[name]] * 8 for name in ends}
     frame = metrics(["CartPole-v1"], list(times), seeds=8, **values)
-    result = comparisons(frame, SETTINGS).set_index("metric").loc["sample_efficiency"]
+    result = comparisons(frame, QUICK).set_index("metric").loc["sample_efficiency"]
     end, restricted, events = min(budgets), {}, {}
     for name in times:
         late = np.array(flags[name], bool) | (np.array(times[name]) > end)
@@ -280,16 +275,16 @@ def test_censoring_is_respected(budgets):
     assert result["censored"] == sum(np.isinf(values).sum() for values in events.values())
 
 
-def test_aggregate_against_a_loop(study: Study):
+def test_aggregate_against_a_loop():
     """Scores between random (0) and the best run (1), resampled within environments."""
     frame = table_for_scores(SEEDS)
-    score = a.scores(frame, study.metrics)
+    score = a.scores(frame, STUDY.metrics)
     for (env, metric), own in score.groupby(["env", "metric"]):
         returns = frame.loc[frame["env"] == env, metric]
-        random = study.metrics.random_return_in(env)
+        random = STUDY.metrics.random_return_in(env)
         expected = (returns - random) / (returns.max() - random)
         assert own["score"].tolist() == pytest.approx(expected.tolist())
-    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])
+    found = a.aggregate(frame, STUDY.metrics).set_index(["metric", "variant"])
     runs = score[(score["metric"] == "final_return") & (score["variant"] == "ppo")]
     row = found.loc["final_return", "ppo"]
     assert (row["runs"], row["mean"]) == (22, pytest.approx(runs["score"].mean()))
@@ -304,14 +299,14 @@ def test_aggregate_against_a_loop(study: Study):
     np.testing.assert_allclose(bounds, expected, atol=0.1 * np.ptp(expected))
 
 
-def test_nobody_better_than_random_counts_as_zero_and_one_seed_has_no_interval(study: Study):
+def test_nobody_better_than_random_counts_as_zero_and_one_seed_has_no_interval():
     frame = table_for_scores(SEEDS)
     hopper = frame["env"] == "HopperBulletEnv-v0"
     frame.loc[hopper, list(a.SCORED)] = -3.0
-    found = a.aggregate(frame, study.metrics).set_index(["metric", "variant"])["mean"]
-    other = a.scores(frame[~hopper], study.metrics)
+    found = a.aggregate(frame, STUDY.metrics).set_index(["metric", "variant"])["mean"]
+    other = a.scores(frame[~hopper], STUDY.metrics)
     for key, runs in other.groupby(["metric", "variant"]):
         assert found[key] == pytest.approx(runs["score"].sum() / 22)
-    one = a.aggregate(table_for_scores({"CartPole-v1": 1}), study.metrics)
+    one = a.aggregate(table_for_scores({"CartPole-v1": 1}), STUDY.metrics)
     assert one["mean"].notna().all()
     assert one[["mean_low", "mean_high", "iqm_low", "iqm_high"]].isna().all(axis=None)

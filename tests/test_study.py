@@ -50,6 +50,8 @@ variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capc
 metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'mace_full'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
 variant_settings: {mace_fixed: {beta: {initial: DELETE}}}  # mace_fixed, 'beta.initial', missing
+variant_settings: {mace_fixed: {beta: {floor: 0.5}}}  # beta, floor is 0.5, exceed initial, 0.4
+variant_settings: {x: {beta: {kind: constant, value: 10.5}}}  # beta.value is 10.5, equal to 10
 metrics: {confidence: 95}  # metrics.confidence, 95, less than 1
 metrics: {bootstrap_repetitions: 99}  # metrics.bootstrap_repetitions, 99, 100
 metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-v1, nan, finite

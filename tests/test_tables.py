@@ -20,6 +20,7 @@ from invented import (
     ENVIRONMENTS,
     LITERAL,
     PAPERS,
+    QUICK,
     ROBUST,
     STUDY,
     VARIANTS,
@@ -43,19 +44,18 @@ from mace_rl.study.show.report import as_html
 from mace_rl.study.show.sections import of_ledger, of_runs, read_data
 from mace_rl.study.show.tables import Cell, Value, estimate, number
 
-SETTINGS = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 1000})
-metrics = partial(table_for_tables, all_metrics(SETTINGS))
+metrics = partial(table_for_tables, all_metrics(QUICK))
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}
 WORST = Metric("worst", "Worst & last", "return", lambda curve: curve.returns.min())
 SHOWN = {"entropy_coefficient": 1e-05, "hidden_units": [64, 32], "gae_lambda": 1.0}
 PPO = STUDY.run_config("CartPole-v1", "ppo", 0).ppo.model_copy(update=SHOWN)
 
 
-def table1(runs: pd.DataFrame, settings: MetricsConfig = SETTINGS) -> pd.DataFrame:
+def table1(runs: pd.DataFrame, settings: MetricsConfig = QUICK) -> pd.DataFrame:
     return summary.split(summary.summary(runs, settings, CLAIMS.table1), CLAIMS.table1)[0]
 
 
-def supplement(runs: pd.DataFrame, settings: MetricsConfig = SETTINGS) -> pd.DataFrame:
+def supplement(runs: pd.DataFrame, settings: MetricsConfig = QUICK) -> pd.DataFrame:
     return summary.split(summary.summary(runs, settings, CLAIMS.table1), CLAIMS.table1)[1]
 
 
@@ -72,12 +72,12 @@ def cells(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
 def table1_of(**values: object) -> dict[tuple[str, str], str]:
     variants = list(next(iter(values.values())))  # type: ignore[call-overload]
     frame = table1(metrics(["CartPole-v1"], variants, **values))
-    return cells(tables.table1(frame, SETTINGS, CLAIMS.table1))
+    return cells(tables.table1(frame, QUICK, CLAIMS.table1))
 
 
 def test_summary_against_pandas_and_scipy() -> None:
     frame = metrics(seeds=5)
-    result = table1(frame, SETTINGS)
+    result = table1(frame, QUICK)
     assert len(result) == 3 * 3 * 2
     for row in result.itertuples():
         values = frame.query("env == @row.env and variant == @row.variant")[row.metric]
@@ -86,7 +86,7 @@ def test_summary_against_pandas_and_scipy() -> None:
         assert (row.mean, row.low, row.high) == pytest.approx(expected)
         assert (row.seeds, row.censored, row.episodes) == (5, 0, 2000)
         assert row.paper == CLAIMS.table1.value(row.env, row.variant, row.metric)
-    other = table1(metrics(["Pendulum-v1"], ["ppo"]), SETTINGS)
+    other = table1(metrics(["Pendulum-v1"], ["ppo"]), QUICK)
     assert other["paper"].isna().all()
 
 
@@ -113,7 +113,7 @@ def test_table_1_has_bold_ties_censored_means_and_the_papers_numbers() -> None:
 
 def test_companions_have_the_digits_of_their_largest_mean_and_the_users_own_metrics() -> None:
     changes = {"custom": [f"{__name__}:WORST"], "solved_return": {"DeepSea10-v0": 0.5}}
-    own = SETTINGS.model_copy(update=changes)
+    own = QUICK.model_copy(update=changes)
     frame = metrics(["DeepSea10-v0"], ["ppo", "mace_full"]).assign(worst=-7.0)
     small = frame["variant"] == "ppo"
     frame["final_return"] = np.where(small, 0.6934, -0.0001)
@@ -136,14 +136,14 @@ def test_returns_worst_seeds_and_solved_tasks_by_variant_and_environment() -> No
     frame["final_return"] = np.arange(len(frame)) - 3.0
     frame["solved"] = [0.9, 1.0, 0.89] * 4
     frame = frame[(frame["env"] != "B-v0") | (frame["variant"] != "ppo")]
-    means = tables.named(supplement(frame, SETTINGS), LABELS)
-    found = cells(tables.means(means, "final_return", SETTINGS))
+    means = tables.named(supplement(frame, QUICK), LABELS)
+    found = cells(tables.means(means, "final_return", QUICK))
     assert found["PPO (Baseline)", "A-v0"].startswith("−2.00 (")
     assert found["MACE-RL (Full)", "B-v0"].startswith("7.00 (")
     assert found["PPO (Baseline)", "B-v0"] == ""
     worst = {("ppo", "A-v0"): "−3.00", ("ppo", "B-v0"): ""}
     worst |= {("mace_full", "A-v0"): "0.00", ("mace_full", "B-v0"): "6.00"}
-    assert cells(tables.worst(frame, SETTINGS)) == worst
+    assert cells(tables.worst(frame, QUICK)) == worst
     assert cells(tables.solved(frame))["mace_full", "B-v0"] == "2 of 3"
 
 
@@ -154,7 +154,7 @@ def test_betas_are_of_runs_in_which_beta_changes() -> None:
     frame["beta_lowest"] = [0, 0, 0.25, 0.1, 0.2]
     frame["beta_highest"] = [0, 0, 1.0, 0.9, 0.9]
     frame["stagnation_correlation"] = [0.0, 0, 0.5, 0.25, 0.375]
-    (row,) = tables.betas(frame, SETTINGS).to_numpy()
+    (row,) = tables.betas(frame, QUICK).to_numpy()
     low, high = scipy.stats.t.interval(0.95, 2, 0.375, 0.125 / 3**0.5)
     assert list(row[:2]) == ["A-v0", "mace_full"]
     assert list(row[3:5]) == ["0.12, 0.50, 0.90", "0.10, 0.20, 0.25"]
@@ -196,8 +196,8 @@ def test_the_caption_names_intervals_and_budgets(fewest: int, expected: str) -> 
     frame = metrics(seeds=12)
     hopper = frame["env"] == "HopperBulletEnv-v0"
     frame.loc[hopper, "episodes"] = 6000
-    shown = table1(frame[~hopper | (frame["seed"] < fewest)], SETTINGS)
-    fragment = table1_latex(shown, {}, SETTINGS, CLAIMS.table1)
+    shown = table1(frame[~hopper | (frame["seed"] < fewest)], QUICK)
+    fragment = table1_latex(shown, {}, QUICK, CLAIMS.table1)
     assert expected in fragment
     assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
     assert "nan" not in fragment and (r"{\scriptsize --/--}" in fragment) == (fewest == 1)
@@ -249,8 +249,8 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     many["episodes"] = 6000
     labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
     fragments = [
-        table1_latex(table1(many, SETTINGS), labels, SETTINGS, CLAIMS.table1),
-        table1_latex(table1(metrics(seeds=1), SETTINGS), {}, SETTINGS, CLAIMS.table1),
+        table1_latex(table1(many, QUICK), labels, QUICK, CLAIMS.table1),
+        table1_latex(table1(metrics(seeds=1), QUICK), {}, QUICK, CLAIMS.table1),
         table2_latex({"A_b-v0": PPO, "B-v0": PPO.model_copy(update={"clip": 0.1})}, CLAIMS.table2),
     ]
     assert re.findall(r"Algorithm & (.*) \\\\", fragments[0]) == [
@@ -271,13 +271,13 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
 
 def test_names_are_read_as_they_were_written(tmp_path: Path) -> None:
     runs = metrics(["CartPole-v1"], ["NA", "None", "nan", "0.1", "1e3", "True", "007"])
-    runs = runs.astype(metrics_columns(all_metrics(SETTINGS)))
-    pairs = SETTINGS.model_copy(update={"comparisons": [["NA", "0.1"]]})
+    runs = runs.astype(metrics_columns(all_metrics(QUICK)))
+    pairs = QUICK.model_copy(update={"comparisons": [["NA", "0.1"]]})
     made = {"metrics": runs, "table1": table1(runs), "comparisons": comparisons(runs, pairs)}
     for name, frame in made.items():
         frame.to_csv(tmp_path / f"{name}.csv", index=False)
     of_runs = runs[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
-    read, _ = read_data({name: tmp_path / f"{name}.csv" for name in made}, list(of_runs), SETTINGS)
+    read, _ = read_data({name: tmp_path / f"{name}.csv" for name in made}, list(of_runs), QUICK)
     for name, frame in made.items():
         pd.testing.assert_frame_equal(read[name], frame.reset_index(drop=True), check_dtype=False)
 
@@ -286,13 +286,13 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     runs = metrics(seeds=10)
     kinds = {"table1": table1, "supplement": supplement, "comparisons": comparisons}
     kinds["aggregate"] = aggregate
-    data = {name: make(runs, SETTINGS) for name, make in kinds.items()}
+    data = {name: make(runs, QUICK) for name, make in kinds.items()}
     beta = {"beta_end": 0.5, "beta_lowest": runs["seed"] / 10, "beta_highest": 0.6}
     beta["stagnation_correlation"] = 0
     data |= {"metrics": runs, "betas": runs[["env", "variant", "seed"]].assign(**beta)}
     equal = dict.fromkeys(VARIANTS, 0.0)
-    claims = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, PAPERS)
-    shown = [*of_ledger(claims, CLAIMS), *of_runs(data, CLAIMS, SETTINGS, {})]
+    claims = ledger(table_for_claims(12, equal, noise=0.02), QUICK, PAPERS)
+    shown = [*of_ledger(claims, CLAIMS), *of_runs(data, CLAIMS, QUICK, {})]
     page = markdown_page("Tables", "Made by hand.", shown, ["figure1"])
     assert page.startswith("# Tables\n\nMade by hand.\n\n![figure1](figure1.png)\n\n## The paper's")
     titles = re.findall("(?m)^## (.*)", page)
@@ -308,14 +308,14 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
         shown = (number(getattr(part, name), digits) for name in ("difference", "low", "high"))
         assert "{} ({} to {})".format(*shown) in page
     # The second rule says more of each part.
-    by_size = ledger(table_for_claims(12, equal, noise=0.02), SETTINGS, BY_SIZE)
+    by_size = ledger(table_for_claims(12, equal, noise=0.02), QUICK, BY_SIZE)
     shown = markdown_page("", "", of_ledger(by_size, BY_SIZE))
     assert "10 not reproduced, 0 open, 0 could not be asked" in shown and "docs/metrics.md" in shown
     part = by_size[0].ways[ROBUST].parts[0]
     ends = " to ".join(number(end) for end in (part.predicted_low, part.predicted_high))
     assert f"| {number(part.room)} | {ends} | {part.replication} | small | absent |" in shown
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
-    alone = {name: make(runs.iloc[:10], SETTINGS) for name, make in kinds.items()}
+    alone = {name: make(runs.iloc[:10], QUICK) for name, make in kinds.items()}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}
-    page = markdown_page("", "", of_runs(alone, CLAIMS, SETTINGS, {}))
+    page = markdown_page("", "", of_runs(alone, CLAIMS, QUICK, {}))
     assert not re.search("who is better|claims|environments together|## β|!\\[|nan", page)

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import LAYER_NORM, ROOT, VARIANTS, Bonanza, Twin, finish
+from shared import LAYER_NORM, NETWORKS, ROOT, SOON, VARIANTS, Bonanza, Twin, finish
 
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
@@ -20,8 +20,6 @@ from mace_rl.trainer import Trainer
 
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}
 AS_THEY_ARE = dict.fromkeys(("normalise_observations", "scale_rewards", "scale_advantages"), False)
-SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
-NETWORKS = ["actor", "extrinsic", "intrinsic"]
 # One update per episode as in the paper's runs; several episodes with minibatches; in torch.
 SETTINGS = {
     "an episode": {},
@@ -293,8 +291,9 @@ def test_global_generators_are_left_alone(run_config, settings):
 )
 def test_state_holds_all_that_the_rest_depends_on(run_config, environment, variant, settings):
     """Continued by a new trainer from what a file would hold, with several episodes a rollout."""
-    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}, "meta": {"horizon": 2}}
-    changes |= {"novelty": SOON}
+    changes = {"episodes": 16, "ppo": {"rollout_steps": 25}}
+    changes["novelty"] = SOON | {"refresh_every": 60}  # so that some states wait
+    changes["meta"] = {"horizon": 2, "credit_threshold": 0.0}  # and each credit moves β
     config = run_config(environment, variant, 2, **merge(SETTINGS[settings], changes))
     whole = Trainer(config)
     rounds = whole.run()

@@ -325,11 +325,8 @@ BAD = [GOOD + np.inf] * 99
     ("env", "error", "message"),
     [
         (observing([GOOD, []]), ConfigError, r"\[\] of shape \(0,\) after step 1, but its obs"),
-        (
-            observing([GOOD, [0]]),
-            ConfigError,
-            r"of shape \(1,\) after step 1",
-        ),  # as numpy stretches
+        # As numpy stretches.
+        (observing([GOOD, [0]]), ConfigError, r"of shape \(1,\) after step 1"),
         (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\) after step 1, but"),
         (observing([5, 6, 7, 8], THREE), ConfigError, "observation 8 of shape .* after step 3"),
         (observing([4], THREE), ConfigError, "observation 4 of shape .* after the reset"),

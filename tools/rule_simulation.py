@@ -29,7 +29,8 @@ from mace_rl.study.compare.estimates import FEWEST_SEEDS, LEVEL, Pair, find, pai
 from mace_rl.study.compare.ledger import SizedFinding
 from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import BEFORE, CORRELATION, CORRELATIONS, METRICS
+from mace_rl.study.measure.betas import BEFORE, CORRELATION, CORRELATIONS
+from mace_rl.study.measure.metrics import METRICS
 from mace_rl.study.metrics_config import MetricsConfig
 
 SETTINGS = read_study([Path("config.yaml")]).metrics

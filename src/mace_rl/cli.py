@@ -104,9 +104,8 @@ def _require_at_least(smallest: int, arguments: argparse.Namespace, *names: str)
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require_at_least(1, arguments, "episodes")
     _require_at_least(0, arguments, "seed")
-    _ = FinishedRun(
-        arguments.folder, arguments.trust
-    ).agent_config  # before PyTorch, which takes seconds
+    # Before PyTorch, which takes seconds.
+    _ = FinishedRun(arguments.folder, arguments.trust).agent_config
 
 
 def run_config(arguments: argparse.Namespace) -> RunConfig:

@@ -9,7 +9,8 @@ from mace_rl.records import read_table
 from mace_rl.runs.provenance import read_record
 from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare import ledger, verdicts
-from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
+from mace_rl.study.measure.betas import betas_columns
+from mace_rl.study.measure.metrics import read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import markdown, sections
 

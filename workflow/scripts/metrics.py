@@ -4,7 +4,8 @@ from job import job
 
 from mace_rl.files import write_atomically
 from mace_rl.runs.finished import read_runs
-from mace_rl.study.measure.run_metrics import betas_table, metrics_table
+from mace_rl.study.measure.betas import betas_table
+from mace_rl.study.measure.metrics import metrics_table
 from mace_rl.study.metrics_config import MetricsConfig
 
 with job(snakemake):

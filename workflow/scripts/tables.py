@@ -7,7 +7,7 @@ from mace_rl.study.claims_config import parse_claims
 from mace_rl.study.compare.aggregate import aggregate
 from mace_rl.study.compare.comparisons import comparisons
 from mace_rl.study.compare.summary import split, summary
-from mace_rl.study.measure.run_metrics import read_metrics
+from mace_rl.study.measure.metrics import read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show.latex import table1_latex
 

@@ -53,14 +53,6 @@ def merge(
     return merged
 
 
-def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
-    """`merge` for settings of runs: `beta` is replaced, and `bonus` if its `kind` changes."""
-    bonuses = [bonus for bonus in (base.get("bonus"), over.get("bonus")) if bonus is not None]
-    kinds = [bonus.get("kind") for bonus in bonuses if isinstance(bonus, Mapping)]
-    same = len(kinds) < 2 or kinds[1] in (kinds[0], None)
-    return merge(base, over, whole={"beta"} if same else {"beta", "bonus"})
-
-
 def _read(text: str, origin: str) -> Any:
     """The value of a YAML text; a `ConfigError` with the place of the first mistake."""
     try:

@@ -10,7 +10,8 @@ from pydantic import Field, model_validator
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
-from mace_rl.study.measure.metrics import CORRELATIONS, METRICS, all_metrics
+from mace_rl.study.measure.betas import CORRELATIONS
+from mace_rl.study.measure.metrics import METRICS, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 
 if TYPE_CHECKING:  # imports Gymnasium, which tables do without

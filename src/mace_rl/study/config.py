@@ -18,7 +18,7 @@ import gymnasium
 from pydantic import AfterValidator, Field, ValidationError
 
 from mace_rl.config.plugins import import_module, load, source_files
-from mace_rl.config.reading import Settings, merge, merge_layers, read_yaml
+from mace_rl.config.reading import Settings, merge, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, check_known, explain, short_repr
 from mace_rl.environments import registered
@@ -233,6 +233,14 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
             )
     _check_environment(config)
     return config
+
+
+def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
+    """`merge` for settings of runs: `beta` is replaced, and `bonus` if its `kind` changes."""
+    bonuses = [bonus for bonus in (base.get("bonus"), over.get("bonus")) if bonus is not None]
+    kinds = [bonus.get("kind") for bonus in bonuses if isinstance(bonus, Mapping)]
+    same = len(kinds) < 2 or kinds[1] in (kinds[0], None)
+    return merge(base, over, whole={"beta"} if same else {"beta", "bonus"})
 
 
 def _depth(layer: Any, location: Iterable[Any]) -> int:

@@ -14,8 +14,7 @@ from mace_rl.records import RunKey
 from mace_rl.study.claims_config import Table1Config
 from mace_rl.study.compare.statistics import logrank
 from mace_rl.study.compare.summary import summary
-from mace_rl.study.measure.metrics import Metric, all_metrics
-from mace_rl.study.measure.run_metrics import metrics_table
+from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_table
 from mace_rl.study.metrics_config import MetricsConfig
 
 PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"

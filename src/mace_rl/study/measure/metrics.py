@@ -1,31 +1,33 @@
-"""What is measured on one run: how well it ends, and how soon it gets there (docs/metrics.md).
+"""What is measured on one run, and metrics.csv: how well it ends, and how soon (docs/metrics.md).
 
 A metric is a pure function of a `LearningCurve`. A run that never attains a metric in episodes
 counts with E, its number of episodes, and is flagged as censored: E is then a lower bound.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import Literal, NamedTuple
+from itertools import zip_longest
+from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-import scipy  # loads what is used of it when it is
 
 from mace_rl.config.plugins import load
 from mace_rl.config.section import ConfigError
+from mace_rl.records import RecordError, RunKey, read_table
 from mace_rl.study.metrics_config import MetricsConfig
+
+if TYPE_CHECKING:  # planning the workflow imports this module, without pandas
+    import pandas as pd
 
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 
-# Of betas.csv, beside the metrics (`METRICS`): in all of training, before and after the common bar.
-CORRELATION = "stagnation_correlation"
-BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
-CORRELATIONS = CORRELATION, BEFORE, AFTER
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 
@@ -119,47 +121,6 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
     """
     total = _moving_sum(returns, window)
     return (total[window:] - total[:-window]) / window**2
-
-
-def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
-    """`slope` from episode 2 · ceil(window / 10) on: single episodes side by side are noise.
-
-    While there are no 2 windows, the halves of the episodes so far are compared.
-    """
-    first = 2 * math.ceil(window / 10)
-    ends = range(first, min(2 * window, len(returns) + 1))
-    growing = [slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
-    return np.concatenate([*growing, slope(returns, window)])
-
-
-def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
-    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
-
-    returns, betas: [E]. Stagnation is minus the `slope`.
-    """
-    return _correlation(-slope(returns, window), betas)
-
-
-def stagnation_correlations(curve: LearningCurve, betas: np.ndarray) -> tuple[float, float]:
-    """The same, by the `growing_slope`, before and after `sample_efficiency_common`.
-
-    betas: [E]. An episode's stagnation and the next one's β are before that episode if both are.
-    0, too, for a time of which there are fewer than two.
-    """
-    reached = sample_efficiency_common(curve)
-    stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
-    until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
-    before = _correlation(stagnation[:until], betas[: reached.number])
-    after = _correlation(stagnation[max(0, until - 1) :], betas)
-    return before, 0.0 if reached.censored else after
-
-
-def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
-    """Of each entry but the last with the β after it; both end with the same episode."""
-    following = betas[len(betas) - len(stagnation) + 1 :]
-    if len(following) < 2 or np.ptp(stagnation[:-1]) == 0 or np.ptp(following) == 0:
-        return 0.0
-    return float(scipy.stats.spearmanr(stagnation[:-1], following).statistic)
 
 
 def sample_efficiency(curve: LearningCurve) -> Attained:
@@ -329,6 +290,77 @@ def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}
     values = {metric.name: COLUMN_TYPES[metric.unit] for metric in metrics}
     return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
+
+
+def metrics_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) -> "pd.DataFrame":
+    """One row of `metrics_columns` per run, in the order of `runs`."""
+    import pandas as pd
+
+    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
+    _check_attained("the table of metrics", table, all_metrics(settings))
+    return table
+
+
+def metrics_of_run(
+    frame: "pd.DataFrame", run: RunKey, settings: MetricsConfig
+) -> dict[str, str | int | float]:
+    """The row of metrics.csv of one run, from its records."""
+    environment, variant, seed = run
+    curve = learning_curve(frame, environment, settings)
+    row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
+    row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
+    metrics = all_metrics(settings)
+    for metric in metrics:
+        value = metric.function(curve)
+        if metric.unit == "episodes" and isinstance(value, Attained):
+            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
+        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
+            row[metric.name] = float(value)
+        else:
+            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
+            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
+    return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def learning_curve(
+    frame: "pd.DataFrame", environment: str, settings: MetricsConfig
+) -> LearningCurve:
+    """What the metrics see of the run with these records (`read_episodes`)."""
+    returns = frame["extrinsic_return"].to_numpy()
+    final = final_return(returns, settings.final_fraction)
+    random = settings.random_return_in(environment)
+    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
+    return LearningCurve(returns, final, random, settings, *goals)
+
+
+def read_metrics(
+    path: str | Path, runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> "pd.DataFrame":
+    """Read metrics.csv; `RecordError` unless it has a possible row for each of `runs`, in order.
+
+    runs: of each its environment, variant, seed and number of episodes.
+    """
+    metrics = all_metrics(settings)
+    table = read_table(path, metrics_columns(metrics))
+    found = table[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
+    for line, (run, right) in enumerate(zip_longest(found, map(tuple, runs)), start=2):
+        if run != right:
+            raise RecordError(f"{path}: line {line}: the run {run} stands where {right} belongs")
+    _check_attained(str(path), table, metrics)
+    return table
+
+
+def _check_attained(origin: str, table: "pd.DataFrame", metrics: Sequence[Metric]) -> None:
+    """Refuse episodes outside of training, and flags that contradict them."""
+    for metric in (metric for metric in metrics if metric.unit == "episodes"):
+        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
+        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
+        if not right.all():
+            row = int(np.argmin(right))
+            raise RecordError(
+                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
+                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
+            )
 
 
 def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:

@@ -12,7 +12,8 @@ from mace_rl.study.compare.comparisons import ALL
 from mace_rl.study.compare.estimates import POWER
 from mace_rl.study.compare.ledger import Answer, read_ledger
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.measure.run_metrics import betas_columns, read_metrics
+from mace_rl.study.measure.betas import betas_columns
+from mace_rl.study.measure.metrics import read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
 
