@@ -202,6 +202,6 @@ def test_the_exact_p_of_the_part_that_hangs_on_chance_is_what_the_study_says() -
     p[[*ours]] = [exact(part["variant"], part["baseline"]) for part in ours.values()]
     (hangs,) = (i for i, part in ours.items() if part["variant"] == "beta_0.1")  # over 1: Q2's
     rank = (p < p[hangs]).sum()
-    said = (ROOT / "docs" / "study.md").read_text(encoding="utf-8")
+    said = (ROOT / "docs" / "confirmation.md").read_text(encoding="utf-8")
     assert f"corrected p of {parts[hangs]['p_holm']:.4f} by" in said
     assert f"Exactly it is {p[hangs] * (len(p) - rank):.4f}" in said
