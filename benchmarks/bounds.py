@@ -1,9 +1,9 @@
 """What a training cannot be faster than: its products and distances, and what it moves.
 
 Arithmetic: the operations of matrix products (columns padded to 16) and k-NN distances, at the rate
-of our product of two 64 × 64 matrices. Memory: bytes that pass between the nearest cache and the
+of our product of two 64 × 64 matrices. Traffic: bytes that pass between the nearest cache and the
 next, at the rate at which our `dot` reads 256 KB. Neither includes tanh, exp, Adam's roots and
-simulators. Memory counts as if nothing were computed meanwhile.
+simulators. Traffic counts as if nothing were computed meanwhile.
 """
 
 import math
@@ -20,7 +20,7 @@ from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.network import CompiledMLP
 from mace_rl.numerics.products import dot, product
 
-BOUNDS = ("arithmetic", "memory")
+BOUNDS = ("arithmetic", "traffic")
 NUMBER = 4  # bytes of a float32
 VECTOR = 2**15  # numbers: two of them are 256 KB
 OF_ADAM = 7  # reads and writes of a step, of each parameter
@@ -36,7 +36,7 @@ class Work:
         """So many passes of `rows` through a network; a single row stays in the nearest cache."""
         layers = [(int(ins), math.ceil(outs / 16) * 16) for ins, outs in pairwise(sizes)]
         one = sum(2 * ins * outs for ins, outs in layers)
-        hidden = sum(2 * ins * outs for ins, outs in layers[1:])
+        hidden = sum(2 * int(ins) * int(outs) for ins, outs in pairwise(sizes[1:]))
         self.operations += rows * (forward * one + backward * (one + hidden))
         if rows > 1:
             blocks = math.ceil(rows / compiled_learner.BLOCK)
@@ -91,7 +91,7 @@ class Work:
     def seconds(self) -> dict[str, float]:
         """By `BOUNDS`, at this core's rates."""
         operations, moved = core_rates()
-        return {"arithmetic": self.operations / operations, "memory": self.bytes / moved}
+        return {"arithmetic": self.operations / operations, "traffic": self.bytes / moved}
 
 
 def counted(owner: Any, name: str, count: Callable[..., None]) -> None:
