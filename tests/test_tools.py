@@ -207,9 +207,9 @@ def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatc
     assert counted.records == plain.records
     steps = plain.records[-1].env_steps
     weights = 4 * 64 + 64 * 64 + 64 * 16  # in products: outputs are filled up to 16
-    backward = weights + 64 * 64 + 64 * 2
+    inward = 2 * 64 * 64 + 64 * 2 + 64 * 1  # gradients of the hidden layers, of two logits, a value
     acting_and_values = steps + steps + 3  # the critic sees an episode's last state, too
-    expected = 2 * (weights * acting_and_values + 2 * 4 * steps * (weights + backward))
+    expected = 2 * (weights * acting_and_values + 4 * steps * (4 * weights + inward))
     assert work.operations == expected
     assert work.bytes > 0
 
