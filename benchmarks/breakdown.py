@@ -1,4 +1,4 @@
-"""Where a training's time goes, by part of the program.
+"""Where a training's time goes, by part of the program; `bounds` says what bounds it.
 
 The program has no timers of its own: its functions are wrapped here from outside.
 """
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from benchmarks.bounds import BOUNDS, Work
 from benchmarks.measuring import (
     CARTPOLE,
     ENVIRONMENTS,
@@ -51,12 +52,12 @@ FUNCTIONS = (
 
 
 class Stopwatch:
-    """Seconds by section. Sections nest: the inner one's time is not the outer one's."""
+    """CPU seconds by section. Sections nest: the inner one's time is not the outer one's."""
 
     def __init__(self, section: str) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self._sections = [section]  # the innermost last
-        self._since = time.perf_counter()
+        self._since = time.process_time()
 
     def wrap(self, section: str, owner: Any, name: str) -> None:
         """Replace the function `owner.name` by itself with its time booked on `section`."""
@@ -79,23 +80,37 @@ class Stopwatch:
         return dict(self.seconds)
 
     def _book(self) -> None:
-        now = time.perf_counter()
+        now = time.process_time()
         self.seconds[self._sections[-1]] += now - self._since
         self._since = now
 
 
 def measure(scale: Scale) -> list[dict[str, Any]]:
-    """A row for each part of each of our trainings."""
+    """A row for each part of each of our trainings, and for each of `BOUNDS`."""
     rows: list[dict[str, Any]] = []
     for environment in ENVIRONMENTS:
         for contestant in OURS:
             what = contestant, environment, FIRST_SEED, scale.steps[environment]
             steps, found = in_fresh_process(profile, *what)
             identity = {"env": environment, "contestant": contestant, "steps": steps}
+            found |= in_fresh_process(bounds, *what)
             rows += [
-                identity | {"part": part, "seconds": found.get(part, 0.0)} for part in ALL_SECTIONS
+                identity | {"part": part, "seconds": found.get(part, 0.0)}
+                for part in (*ALL_SECTIONS, *BOUNDS)
             ]
     return rows
+
+
+def bounds(contestant: str, environment: str, seed: int, steps: int) -> dict[str, float]:
+    """Seconds that the same training cannot do without, by `BOUNDS`."""
+    from mace_rl.trainer import Trainer
+
+    trainer, work = Trainer(our_config(contestant, environment, seed)), Work()
+    work.watch(trainer)
+    for records in trainer.run():
+        if records[-1].env_steps >= steps:
+            break
+    return work.seconds()
 
 
 def profile(
@@ -140,9 +155,9 @@ def compiled_step_seconds(environment: str) -> float:
     cartpole = environment == CARTPOLE
     actions = np.random.default_rng(0).integers(2, size=200_000)
     _steps(cartpole, actions[:10], 2.0)
-    start = time.perf_counter()
+    start = time.process_time()
     _steps(cartpole, actions, 2.0)
-    return (time.perf_counter() - start) / len(actions)
+    return (time.process_time() - start) / len(actions)
 
 
 @njit

@@ -39,7 +39,9 @@ PYTHON = HOME / "bin" / "python"
 VARIABLES = dict.fromkeys(THREADS, "1") | {
     "JAX_PLATFORMS": "cpu",
     "NPROC": "1",  # the size of XLA's thread pools
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    # After what is set from outside, such as --xla_cpu_max_isa=AVX2.
+    "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")
+    + " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "GIT_TERMINAL_PROMPT": "0",  # nothing asks for a password
 }
 

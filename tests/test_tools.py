@@ -10,7 +10,7 @@ import pytest
 import yaml
 from shared import ROOT, Bonanza, message
 
-from benchmarks import breakdown, purejaxrl
+from benchmarks import bounds, breakdown, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
 from mace_rl.study.config import read_study
@@ -186,6 +186,32 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()
+
+
+def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatch):
+    """One update an episode: four epochs of both networks, which see four numbers."""
+    from mace_rl.trainer import Trainer
+
+    owners = ("improve_policy", "improve_values", "policy_gradients")
+    for owner, name in (
+        *((bounds.compiled_learner, name) for name in owners),
+        *((bounds.CompiledMLP, name) for name in ("forward", "backward")),
+        (bounds.Neighbours, "nearest"),
+    ):  # put back after the test
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+    config = run_config("CartPole-v1", "ppo", episodes=3)
+    plain, counted, work = Trainer(config), Trainer(config), bounds.Work()
+    assert len(list(plain.run())) == 3
+    work.watch(counted)
+    assert len(list(counted.run())) == 3
+    assert counted.records == plain.records
+    steps = plain.records[-1].env_steps
+    weights = 4 * 64 + 64 * 64 + 64 * 16  # in products: outputs are filled up to 16
+    inward = 2 * 64 * 64 + 64 * 2 + 64 * 1  # gradients of the hidden layers, of two logits, a value
+    acting_and_values = steps + steps + 3  # the critic sees an episode's last state, too
+    expected = 2 * (weights * acting_and_values + 4 * steps * (4 * weights + inward))
+    assert work.operations == expected
+    assert work.bytes > 0
 
 
 def test_purejaxrl_s_training_imports_nothing_but_what_its_environment_has():
