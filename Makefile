@@ -60,8 +60,8 @@ verify: setup ## repeat a sample of the nine short runs and one of each kept wor
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 	folder=$$(mktemp -d)
 	trap 'rm -rf "$$folder"' EXIT
-	for world in reference/worlds/*/; do
-	    $(IN_VENV) tools.kept_runs unpack "$$world" "$$folder/$$(basename "$$world")" --sample 1 >/dev/null
+	for world in $(wildcard reference/worlds/tuned reference/worlds/plain reference/worlds/tasks); do
+	    $(IN_VENV) tools.kept_runs unpack "$$world" "$$folder/$${world##*/}" --sample 1 >/dev/null
 	done
 	$(IN_VENV) mace_rl.cli verify "$$folder" --trust # a rule for β is of extras/
 
