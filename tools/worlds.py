@@ -97,7 +97,7 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     note = (
         "Median and central 90 % of each world's seeds. *: the paper's number is not among these."
     )
-    sections.append(Section("The paper's 18 numbers", note, frame))
+    sections.append(Section("The paper's numbers", note, frame))
     rows = [
         [
             row.world,

@@ -96,7 +96,8 @@ def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: P
 
     runs: by world the frame of metrics.csv.
     """
-    environments = list(table1.values)
+    seen = set().union(*(table["env"] for table in runs.values()))
+    environments = [env for env in table1.values if env in seen]
     variants, jitter = list(table1.variants), np.random.default_rng(0)
     with style():
         panels = len(environments) * len(table1.public_code)
