@@ -287,6 +287,11 @@ MISTAKES = [  # one text for another, and what is said of it
     ("          robust: *above\n", "", ["C7.parts", "'robust'] as the first"]),
     ("    C2:", "    Q1:", ["elsewhere.claims.Q1", "twice"]),
     ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
+    (
+        "public_code: [sample_efficiency, ",
+        "public_code: [",
+        ["table1.public_code", "in this order"],
+    ),
     ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
     ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
     ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),

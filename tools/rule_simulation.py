@@ -83,6 +83,7 @@ class World(NamedTuple):
     runs: pd.DataFrame
     seeds: Mapping[str, int]
     together: bool  # whether a variant's runs are drawn from those of all
+    apart: bool  # whether correlations are drawn by themselves, since PPO has none
     settings: MetricsConfig
 
 
@@ -90,7 +91,7 @@ def world(name: str) -> World:
     """One of docs/worlds-protocol.md."""
     wanted = read_study([Path("config.yaml"), Path(f"config/worlds/{name}.yaml")]).runs()
     seeds = Counter(env for env, variant, _ in wanted if variant == "ppo")
-    return World(_pilot(name), seeds, name != "tuned", EXACT)
+    return World(_pilot(name), seeds, name != "tuned", True, EXACT)
 
 
 def _pilot(name: str) -> pd.DataFrame:
@@ -123,7 +124,7 @@ def study(truth: str, origin: World, draws: np.random.Generator) -> pd.DataFrame
         new = new.assign(variant=variant, seed=range(seeds))
         for metric in new.columns.intersection([*CORRELATIONS, *EPISODES]):
             value = CLAIMS[1].table1.values_of([env], metric).get(variant)
-            if metric in CORRELATIONS:  # which PPO has none of
+            if metric in CORRELATIONS and (origin.apart or truth == NOTHING):
                 chosen = own[metric].sample(seeds, replace=True, random_state=draws)
                 nothing = own[metric].mean() if truth == NOTHING else 0.0
                 new[metric] = (chosen - nothing).to_numpy()
@@ -195,7 +196,7 @@ def main(studies: int, worlds: bool) -> None:
             print(*cell, *np.round(np.max(list(shares), axis=0), 1), sep=" | ", flush=True)
         print("\ntrue | seeds | rule", claims, sep=" | ")
         for truth, seeds in product((BEST, TABLE1, NOTHING), SEEDS):
-            alike = World(RUNS, dict.fromkeys(RUNS["env"], seeds), False, SETTINGS)
+            alike = World(RUNS, dict.fromkeys(RUNS["env"], seeds), False, False, SETTINGS)
             for rule, texts in said(truth, alike, studies, pool).items():
                 print(truth, seeds, rule, *texts, sep=" | ", flush=True)
 

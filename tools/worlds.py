@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from mace_rl.study.claims_config import read_claims
 from mace_rl.study.compare.draw import draw, numbers
@@ -25,7 +26,7 @@ from mace_rl.study.show.sections import Section
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
 CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
-WAYS = {"robust": "verdicts", "by the paper's words and code": "verdicts_by_words"}
+DECIDES = "robust"  # the way to measure that is pictured
 COMMAND = "`python -m tools.worlds`"
 
 
@@ -41,10 +42,13 @@ def make(folder: Path) -> list[str]:
     curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in there}
     ledgers = {world: folder / world / "claims.json" for world in there}
     answers = {world: read_ledger(path) for world, path in ledgers.items() if path.exists()}
-    tables, pictures = {}, {}
+    tables: dict[str, pd.DataFrame] = {}
+    pictures: dict[str, Figure] = {}
     if answers:
-        tables = {name: worlds.verdicts(answers, way) for way, name in WAYS.items()}
-        pictures["verdicts"] = worlds.draw_verdicts(tables["verdicts"])
+        tables["verdicts"] = worlds.verdicts(answers)
+        pictures["verdicts"] = worlds.draw_verdicts(
+            tables["verdicts"].query("measured == @DECIDES")
+        )
     places = [numbers(own, table1).assign(world=world) for world, own in runs.items()]
     draws = [draw(own, table1)._asdict() | {"world": world} for world, own in runs.items()]
     tables |= {"numbers": pd.concat(places), "draws": pd.DataFrame(draws)}
@@ -71,9 +75,9 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     """The tables in words, for README.md."""
     said = "{verdict}; {shown} of {parts} shown; room {least_room:.2g} to {most_room:.2g}"
     sections = []
-    for way, name in WAYS.items() if "verdicts" in tables else ():
-        rows: Any = tables[name].to_dict("records")
-        long = tables[name].assign(said=[said.format(**row) for row in rows])
+    for way, own in tables["verdicts"].groupby("measured") if "verdicts" in tables else ():
+        rows: Any = own.to_dict("records")
+        long = own.assign(said=[said.format(**row) for row in rows])
         wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
         order = long[["claim", "statement"]].drop_duplicates()
         frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")

@@ -44,7 +44,7 @@ class Table1Config(Section):
 
     caption: str  # the names of its metrics
     metrics: Names  # readings of one are the metrics whose names begin with its name
-    public_code: list[str] = Field(default=[])  # the same by the public code; asked of noise, too
+    public_code: list[str] = Field(default=[])  # a reading of each by its rule; or none
     variants: Annotated[dict[str, str], Field(min_length=1)]  # and what the ledger calls them
     # By environment and variant a number for each metric.
     values: dict[str, dict[str, list[int | float]]]
@@ -231,6 +231,15 @@ def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
 def _check_form(claims: ClaimsConfig) -> None:
     """Refuse a Table 1 with holes, and claims that cannot be told apart or judged together."""
     table1, seen = claims.table1, set()
+    read = [*zip(table1.public_code, table1.metrics, strict=False)]
+    if table1.public_code and not (
+        len(table1.public_code) == len(table1.metrics)
+        and all(reading.startswith(metric) for reading, metric in read)
+    ):
+        raise ConfigError(
+            f"table1.public_code is {table1.public_code}, but should be a reading of each of"
+            f" {table1.metrics}, in this order, or nothing"
+        )
     for environment, rows in table1.values.items():
         for variant in {*rows, *table1.variants}:
             numbers = rows.get(variant, [])

@@ -1,5 +1,6 @@
 """Pictures of several studies of the same claims: each a *world* (docs/worlds-protocol.md)."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,20 +27,21 @@ LINE = 0.15  # inches
 COLOURS = ("#949494", "#56b4e9", "#ca9161")
 
 
-def verdicts(worlds: Mapping[str, Sequence[Answer]], way: str) -> pd.DataFrame:
-    """A row per claim and world, measured this way.
+def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
+    """A row per way of measuring, claim and world.
 
-    Columns: claim, statement, world, outcome, verdict, parts, shown (how many of these), worth (how
-    many of those are worth mentioning), least_room and most_room (of its parts, in margins).
+    Columns: measured (in which way), claim, statement, world, outcome, verdict, parts, shown (how
+    many of these), worth (how many of those are worth mentioning), least_room and most_room (of its
+    parts, in margins).
     """
     rows = [
-        (answer.claim, answer.statement, world, *_counted(answer.ways[way]))
+        (how, answer.claim, answer.statement, world, *_counted(judged))
         for world, answers in worlds.items()
         for answer in answers
-        if way in answer.ways
+        for how, judged in answer.ways.items()
     ]
-    names = ["claim", "statement", "world", "outcome", "verdict", "parts", "shown", "worth"]
-    return pd.DataFrame(rows, columns=[*names, "least_room", "most_room"])
+    names = ["measured", "claim", "statement", "world", "outcome", "verdict", "parts", "shown"]
+    return pd.DataFrame(rows, columns=[*names, "worth", "least_room", "most_room"])
 
 
 def _counted(judged: Judgement) -> tuple[Any, ...]:
@@ -98,33 +100,31 @@ def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: P
     """
     seen = set().union(*(table["env"] for table in runs.values()))
     environments = [env for env in table1.values if env in seen]
-    variants, jitter = list(table1.variants), np.random.default_rng(0)
+    middles = np.arange(len(table1.variants)) * (len(runs) + 1) + (len(runs) - 1) / 2
+    jitter = np.random.default_rng(0)
     with style():
-        panels = len(environments) * len(table1.public_code)
-        figure, axes_of = grid(panels, len(table1.public_code), "Training episodes", height=2.0)
-        places = iter(axes_of)
-        for env in environments:
-            for column, metric in enumerate(table1.public_code):
-                axes = next(places)
-                for strip, variant in enumerate(variants):
-                    for number, (world, table) in enumerate(runs.items()):
-                        own = table[(table["env"] == env) & (table["variant"] == variant)][metric]
-                        low = strip * (len(runs) + 1) + number
-                        dots: dict[str, Any] = {"s": 5, "linewidth": 0, "alpha": 0.7}
-                        dots |= {"color": COLOURS[number], "label": world}
-                        axes.scatter(own, low + jitter.uniform(-0.3, 0.3, len(own)), **dots)
-                    ends = strip * (len(runs) + 1) - 0.5, strip * (len(runs) + 1) + len(runs) - 0.5
-                    paper = table1.values[env][variant][column]
-                    axes.vlines(paper, *ends, color=INK, linewidth=1.3, label="the paper's number")
-                axes.set_xscale("log")
-                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-                axes.xaxis.set_major_formatter("{x:.0f}")
-                axes.minorticks_off()
-                axes.set_title(f"{env}: {look.metrics[metric].lower()}")
-                middles = np.arange(len(variants)) * (len(runs) + 1) + (len(runs) - 1) / 2
-                names = [look.labels[name] for name in variants] if not column else []
-                axes.set_yticks(middles, names or [""] * len(variants))
-                axes.invert_yaxis()
+        cells = list(itertools.product(environments, enumerate(table1.public_code)))
+        width = len(table1.public_code)
+        figure, panels = grid(len(cells), width, "Training episodes", height=2.0)
+        for (env, (column, metric)), axes in zip(cells, panels, strict=True):
+            for middle, variant in zip(middles, table1.variants, strict=True):
+                for number, (world, table) in enumerate(runs.items()):
+                    own = table[(table["env"] == env) & (table["variant"] == variant)][metric]
+                    place = middle + number - (len(runs) - 1) / 2
+                    dots: dict[str, Any] = {"s": 5, "linewidth": 0, "alpha": 0.7, "label": world}
+                    places = place + jitter.uniform(-0.3, 0.3, len(own))
+                    axes.scatter(own, places, color=COLOURS[number], **dots)
+                ends = middle - len(runs) / 2, middle + len(runs) / 2
+                paper = table1.values[env][variant][column]
+                axes.vlines(paper, *ends, color=INK, linewidth=1.3, label="the paper's number")
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:.0f}")
+            axes.minorticks_off()
+            axes.set_title(f"{env}: {look.metrics[metric].lower()}")
+            names = ["" if column else look.labels[name] for name in table1.variants]
+            axes.set_yticks(middles, names)
+            axes.invert_yaxis()
         legend(figure, "Dot: one seed.")
     return figure
 
