@@ -32,6 +32,7 @@ from mace_rl.study.config import read_study
 from mace_rl.study.measure.betas import BEFORE, CORRELATION, CORRELATIONS
 from mace_rl.study.measure.metrics import METRICS
 from mace_rl.study.metrics_config import MetricsConfig
+from tools.worlds import WORLDS
 
 SETTINGS = read_study([Path("config.yaml")]).metrics
 SETTINGS = SETTINGS.model_copy(update={"bootstrap_repetitions": 1000})  # for the time ...
@@ -74,7 +75,7 @@ EVERY = [part for claims in CLAIMS.values() for _, part in parts_of(*claims.fami
 CELLS = {(env, one.metric, one.variant) for one in EVERY for env in one.environments}
 RUNS = pd.read_csv(TABLES / "metrics.csv").merge(pd.read_csv(TABLES / "betas.csv"))
 RUNS = RUNS[["env", "variant", "episodes", *sorted({metric for _, metric, _ in CELLS})]]
-PILOT, WORLDS = Path("reference/measured/pilot.csv"), ("tuned", "plain", "published")
+PILOT = Path("reference/measured/pilot.csv")
 
 
 class World(NamedTuple):
