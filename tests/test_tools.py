@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from shared import ROOT, Bonanza, message
@@ -14,8 +15,21 @@ from benchmarks import bounds, breakdown, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
 from mace_rl.study.config import read_study
-from tools import kept_runs, random_return
+from tools import kept_runs, memory_picture, random_return
 from tools.deposit import DepositError, deposit
+
+
+def test_memory_is_pictured_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_picture, "AFTER", (1, 6))
+    found, first = memory_picture.follow()
+    last = found[max(found)]
+    visits = 10 ** last["visits, log"] - 1
+    # Nothing was won yet: all is relevant now, and of what is remembered nothing was then.
+    assert first == 0
+    assert (last["relevance"] == 1).all()
+    assert last["relevance, confirmation"][0] == 0 and visits[0] > 1
+    np.testing.assert_allclose(last["bonus"], 1 / (1 + visits))
+    assert len(memory_picture.draw(found, first).axes) == 4 * len(found) + 4
 
 
 @pytest.mark.slow
