@@ -1,6 +1,7 @@
 """Generated tasks: seas, corridors and lakes, with and without archives, sparse and dense.
 
-None of them is a task of the study: sizes with and without archives, and the drawn maps, differ.
+None of them is a task of the study: maps and mappings are drawn. Some have the size of one, with
+another number of pages.
 """
 
 from collections import deque
