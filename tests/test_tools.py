@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from shared import ROOT, Bonanza, message
@@ -30,6 +31,24 @@ def test_memory_is_pictured_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     assert last["relevance, confirmation"][0] == 0 and visits[0] > 1
     np.testing.assert_allclose(last["bonus"], 1 / (1 + visits))
     assert len(memory_picture.draw(found, first).axes) == 4 * len(found) + 4
+
+
+def test_the_confirmations_relevance_is_from_the_worst_to_the_best_return() -> None:
+    similarity, recalled = np.array([1, 1, 1, 0.5, 0.5]), np.array([-1, 0, 1, 0, -1])
+    found = memory_picture.confirmations(similarity, recalled, np.array([-1, 0.2, 1]))
+    assert found.tolist() == [0, 0.5, 1, 0.75, 0.5]
+    alike = memory_picture.confirmations(similarity, recalled, np.array([0, 0.05]))
+    assert alike.tolist() == [0, 0, 0, 0.5, 0.5]
+
+
+def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
+    files = [
+        "config.yaml",
+        *(f"config/{name}.yaml" for name in ("questions", "controls", "weights")),
+    ]
+    kept = pd.read_csv(ROOT / "reference/measured/weights.csv")
+    cells = [*kept[["env", "variant", "seed"]].itertuples(index=False, name=None)]
+    assert cells == [*read_study([ROOT / name for name in files]).runs()]
 
 
 @pytest.mark.slow

@@ -26,6 +26,13 @@ AFTER = (200, 300, 500, 1000)  # episodes
 SPAN = 0.1  # of reward: less was no difference to the confirmation's memory
 
 
+def confirmations(similarity: np.ndarray, recalled: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """The confirmation's relevance of N states, whose memory keeps these returns."""
+    span = kept.max() - kept.min()
+    productivity = np.clip((recalled - kept.min()) / span, 0, 1) if span > SPAN else 0.0
+    return 1 - similarity * (1 - productivity)
+
+
 def grids(curiosity: Curiosity) -> dict[str, Any]:
     """What is pictured of each state, [states]."""
     states = np.eye(len(curiosity.normaliser.mean), dtype=np.float32)
@@ -34,12 +41,11 @@ def grids(curiosity: Curiosity) -> dict[str, Any]:
     recalled, similarity = memory.recall(states)
     bonus = curiosity.appraise(states)
     memory.read[:] = read  # nothing was asked: the training goes on as it would
-    kept = memory.values[: len(memory), -1]
-    span = kept.max() - kept.min()
-    productivity = np.clip((recalled - kept.min()) / span, 0, 1) if span > SPAN else 0.0
     return {
         "visits, log": np.log10(1 + curiosity.novelty.counts),  # type: ignore[attr-defined]
-        "relevance, confirmation": 1 - similarity * (1 - productivity),
+        "relevance, confirmation": confirmations(
+            similarity, recalled, memory.values[: len(memory), -1]
+        ),
         "relevance": bonus.relevance,
         "bonus": bonus.reward,
     }
