@@ -164,6 +164,7 @@ def draw_breakdown(rows: pd.DataFrame) -> plt.Figure:
         table = table.loc[list(speed.OURS), breakdown.ALL_SECTIONS].clip(lower=0)
         table.plot.bar(stacked=True, ax=panel, colormap="tab10", legend=False, rot=0)
         panel.set(title=environment, xlabel="", ylabel="µs per environment step")
+        panel.set_ylim(0, 1.05 * table.sum(axis=1).max())
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", reverse=True)
     return figure
 
