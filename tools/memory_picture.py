@@ -104,7 +104,10 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("picture", type=Path, help="a PNG file")
-    save_figure(draw(*follow()), parser.parse_args().picture)
+    picture = parser.parse_args().picture
+    if not picture.parent.is_dir():
+        parser.error(f"there is no folder {picture.parent}")
+    save_figure(draw(*follow()), picture)
     return 0
 
 
