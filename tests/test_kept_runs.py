@@ -57,6 +57,34 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     assert len([*(tmp_path / "again").rglob(files.AGENT)]) == 1
 
 
+def test_a_column_is_kept_in_the_form_that_takes_least_room(tmp_path: Path) -> None:
+    draws, run = np.random.default_rng(0), tmp_path / "results/runs/A-v1/ppo/seed1"
+    make_run(run, 1, episodes=3000)  # the 2nd in all digits, the 3rd and the 4th in six
+    columns = {
+        "episode": np.arange(1, 3001),
+        "env_steps": np.arange(200, 600001, 200),
+        "length": np.full(3000, 200),
+        "extrinsic_return": draws.normal(size=3000) * 1e3,
+        "intrinsic_return": np.array([rounded(10.0**each) for each in draws.uniform(-9, 9, 3000)]),
+        "beta": np.array([rounded(value) for value in draws.uniform(0, 0.5, 3000)]),
+        "terminated": np.zeros(3000, int),
+    }
+    columns["intrinsic_return"][:2], columns["extrinsic_return"][:2] = (0.0, 1e-300), (0.0, -0.0)
+    write_episodes(run / files.EPISODES, columns)
+    record = json.loads((run / files.RECORD).read_text())
+    record["outputs"][files.EPISODES] = file_digest(run / files.EPISODES)
+    (run / files.RECORD).write_text(json.dumps(record))
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    archive = tmp_path / "kept/A-v1/ppo.tar.xz"
+    with tarfile.open(archive) as tar:
+        sizes = {member.name: member.size for member in tar}
+    forms = ["beta.digits", "extrinsic_return.doubles", "intrinsic_return.digits", "length"]
+    assert sorted(sizes) == [*forms, "seed1/run.json", "terminated"]
+    text = (run / files.EPISODES).read_bytes()
+    assert archive.stat().st_size < 0.8 * len(lzma.compress(text))
+    assert kept_runs.read(archive)[f"seed1/{files.EPISODES}"] == text
+
+
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
     for half in (0, 1):
         make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", half)
@@ -166,6 +194,10 @@ HOSTILE = {  # members that are added or replaced, by what is said of them
     "has None seconds": with_record("30", "null"),
     "recursion": with_record("", text="[" * 10**5),
     "invalid literal": {"length": b"\n".join([b"1e9"] * 30)},
+    "should not have 'beta.halves'": {"beta.halves": b""},
+    "should not have 'length.doubles' beside another form": {"length.doubles": bytes(240)},
+    "cannot reshape": {"length": None, "length.doubles": bytes(241)},
+    "zip()": {"length": None, "length.digits": bytes(182)},
     "larger than": {"length": bytes(kept_runs.EXPANDED)},
 }
 
@@ -185,7 +217,8 @@ def test_what_was_never_packed_is_refused_in_one_line(tmp_path, monkeypatch, sai
     with tarfile.open(path) as tar:
         members = {name: tar.extractfile(name).read() for name in tar.getnames()}
     if isinstance(damage, dict):
-        damage = tar_of([(*one, b"0") for one in (members | damage).items()])
+        members |= damage
+        damage = tar_of([(*one, b"0") for one in members.items() if one[1] is not None])
     path.write_bytes(damage)
     for name in ("..", ".", ""):  # which would be other folders
         odd = tmp_path / "odd" / "A-v1" / f"{name}.tar.xz"

@@ -10,13 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from PIL import Image
 from shared import ROOT, Bonanza, message
 
 from benchmarks import bounds, breakdown, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
 from mace_rl.study.config import read_study
-from tools import kept_runs, memory_picture, random_return
+from tools import kept_runs, memory_picture, random_return, tables
 from tools.deposit import DepositError, deposit
 
 
@@ -49,6 +50,18 @@ def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
     kept = pd.read_csv(ROOT / "reference/measured/weights.csv")
     cells = [*kept[["env", "variant", "seed"]].itertuples(index=False, name=None)]
     assert cells == [*read_study([ROOT / name for name in files]).runs()]
+
+
+def test_a_kept_picture_has_256_colours_and_looks_the_same(tmp_path: Path) -> None:
+    fade = np.linspace(0, 255, 200).astype(np.uint8)
+    colours = np.dstack([*np.meshgrid(fade, fade), np.full((200, 200), 90, np.uint8)])
+    colours[50:150, 50:150] = 31, 119, 180  # an area, which keeps its colour
+    Image.fromarray(colours).convert("RGBA").save(tmp_path / "a.png")
+    tables.reduce_colours(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as picture:
+        apart = np.asarray(picture.convert("RGB"), int) - colours
+        assert picture.mode == "P" and len(picture.getcolors()) <= 256
+    assert abs(apart).max() < 32 and not apart[50:150, 50:150].any()
 
 
 @pytest.mark.slow
@@ -87,6 +100,8 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     assert tabulate() == (new + made, "") and not stale.exists()
     readme = (kept / "README.md").read_text()
     assert readme.startswith("# small\n") and readme.count("![") == 1
+    with Image.open(kept / "figure1.png") as picture:
+        assert picture.mode == "P"
     assert "![figure1](figure1.png)" in readme and "## Mean return of training" in readme
 
     metrics = (kept / "metrics.csv").read_bytes()

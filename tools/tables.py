@@ -7,9 +7,9 @@ The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY
 configuration that the study had, the outputs that reference/studies.yaml names, and README.md:
 tables.md with the pictures that are among these, and for the confirmation's studies the verdicts of
 the first study beside theirs. What the worlds of docs/worlds-protocol.md say together comes into
-results/tables/worlds. All is compared with reference/tables. New files are kept there, and
-README.md, which only shows the others, is renewed;
-with --check both are mistakes. With --report only the page of one study is made, and not compared.
+results/tables/worlds. Pictures are reduced to 256 colours. All is compared with reference/tables.
+New files are kept there, and README.md, which only shows the others, is renewed; with --check both
+are mistakes. With --report only the page of one study is made, and not compared.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from PIL import Image
 
 from mace_rl.config.reading import read_yaml
 from mace_rl.study.compare.ledger import Answer, answer_of, read_ledger
@@ -107,6 +108,13 @@ def beside_the_first(first: Sequence[Answer], second: Sequence[Answer]) -> str:
     )
 
 
+def reduce_colours(picture: Path) -> None:
+    """Keep the 256 colours of a PNG file that lie nearest: two fifths of the bytes."""
+    with Image.open(picture) as image:
+        reduced = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    reduced.save(picture, optimize=True)
+
+
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
     """The outputs that are not those in `EXPECTED`, where new ones and pages go, unless `check`."""
     different = []
@@ -157,6 +165,9 @@ def main() -> None:
         outputs[name] = [*outputs[name], README]
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
+    for name, own in outputs.items():
+        for picture in (MADE / name / output for output in own if output.endswith(".png")):
+            reduce_colours(picture)
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
     print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")
