@@ -86,6 +86,8 @@ def test_how_often_a_draw_is_as_favourable(runs: pd.DataFrame) -> None:
         shares[env] = np.array([(counts == k).mean(axis=0) for k in range(3)])
     found = d.draw(runs, TABLE1)
     assert (found.favoured, found.first) == ("mace_full", 2)
+    one = d.draw(runs[runs["env"] == "Acrobot-v1"], TABLE1)  # where PPO is first in as many
+    assert (one.favoured, one.first, one.numbers) == ("mace_full", 1, 6)
     for expected, own in ((found.chance_first, -1), (found.chance_any, slice(None))):
         one, other = (np.atleast_2d(shares[env].T[own]).mean(axis=0) for env in ENVIRONMENTS[:2])
         both = one[2] + one[1] * (other[1] + other[2]) + one[0] * other[2]
@@ -126,7 +128,13 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     assert row.count("reproduced; 2 of 2 shown") == 1 and row.count("; 0 of 2 shown") == 2
     (tmp_path / "tuned/claims.json").unlink()  # as while Hopper's runs are not all there
     shutil.rmtree(tmp_path / "plain")
+    for name in ("metrics", "figure1"):  # nor even CartPole's
+        own = pd.read_csv(tmp_path / f"published/{name}.csv")
+        own[own["env"] == "Acrobot-v1"].to_csv(tmp_path / f"published/{name}.csv")
     worlds.make(tmp_path)
+    page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
+    found = re.findall(r"\| (tuned|published) \| \d+ of (\d+) \| \d+ \| \S+ \| (\d) \|", page)
+    assert found == [("tuned", "18", "4"), ("published", "6", "1")]
     assert set(pd.read_csv(tmp_path / "worlds/verdicts.csv")["world"]) == {"published"}
     assert set(pd.read_csv(tmp_path / "worlds/draws.csv")["world"]) == {"tuned", "published"}
     said = message(monkeypatch, worlds, str(tmp_path / "tuned"))

@@ -108,17 +108,20 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
             f"{row.unusual} of {row.numbers}",
             f"{row.limit}",
             f"{row.chance_unusual:.2g}",
+            f"{row.first}",
             f"{row.chance_first:.3f}",
             f"{row.chance_any:.3f}",
         ]
         for row in records(tables["draws"])
     ]
-    first = tables["draws"].iloc[0]
-    columns = ["world", "unusual", "unlike from", "chance of as many", "as favourable", "by chance"]
+    favoured = look.labels[tables["draws"]["favoured"].iloc[0]]
+    columns = ["world", "unusual", "unlike from", "chance of as many", "columns", "as favourable"]
+    columns.append("by chance")
     note = (
         "One seed of each variant as Table 1. *Chance of as many*: of as many unusual numbers."
-        f" *As favourable*: {look.labels[first['favoured']]} is first in {first['first']} columns"
-        " or more; *by chance*: a variant that is drawn anew in each environment."
+        f" *Columns*: in which {favoured} is first in the paper's table, of the world's"
+        " environments. *As favourable*: it is first in as many or more; *by chance*: a variant"
+        " that is drawn anew in each environment is."
     )
     sections.append(Section("The table as a draw", note, pd.DataFrame(rows, columns=columns)))
     return sections

@@ -25,7 +25,7 @@ class Draw(NamedTuple):
     chance_unusual: float  # that a draw has as many, among the study's other seeds
     limit: int  # so many are seen in fewer than `LEVEL` of the draws
     favoured: str  # the variant that is first in most columns of the paper's table
-    first: int  # in so many columns
+    first: int  # in so many columns of the environments that the study has
     chance_first: float  # that it is first in as many
     chance_any: float  # the same of a variant chosen at random, in each environment by itself
 
@@ -56,11 +56,10 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
     environments = list(dict.fromkeys(env for env, _ in cells))
     found = int(numbers(runs, table1)["unusual"].sum())
     unusual = at_least(_unusual_when_drawn(own) for own in cells.values())
-    paper = {env: first_in(_paper(env, table1)) for env in environments}
-    columns = {
-        name: sum(int(one[name].item()) for one in paper.values()) for name in table1.variants
-    }
-    favoured = max(columns, key=columns.__getitem__)
+    paper = {env: first_in(_paper(env, table1)) for env in table1.values}
+    led = {name: sum(one[name].item() for one in paper.values()) for name in table1.variants}
+    favoured = max(led, key=led.__getitem__)
+    first = sum(int(paper[env][favoured].item()) for env in environments)
     firsts = []
     for env in environments:
         wins = first_in({name: cells[env, name] for name in table1.variants})
@@ -75,9 +74,9 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
         chance_unusual=float(unusual[found]),
         limit=int(np.argmax(np.append(unusual, 0.0) < LEVEL)),
         favoured=favoured,
-        first=columns[favoured],
-        chance_first=float(own[columns[favoured]]),
-        chance_any=float(anyone[columns[favoured]]),
+        first=first,
+        chance_first=float(own[first]),
+        chance_any=float(anyone[first]),
     )
 
 
