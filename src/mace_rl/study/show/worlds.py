@@ -141,10 +141,13 @@ def draw_curves(curves: Mapping[str, pd.DataFrame], shown: Quantity, look: PlotS
         places = iter(panels)
         for world, own in curves.items():
             for env in environments:
-                axes = next(places)
+                axes, means = next(places), own[own["env"] == env]
+                if means.empty:
+                    axes.set_axis_off()
+                    continue
                 axes.set_title(f"{env}, {world}")
                 axes.locator_params(nbins=4)
-                draw_means(axes, own[own["env"] == env], look)
+                draw_means(axes, means, look)
         for column, _ in enumerate(environments):
             for axes in panels[column + len(environments) :: len(environments)]:
                 axes.sharey(panels[column])
