@@ -7,9 +7,9 @@
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
 what is not kept; of seed100 the agent too, unless it is large, which the report shows at play.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
-each in the form that takes least room, and without the columns that the others tell, which takes
-two fifths of the room. Packing again adds seeds to those that are there; equal runs give equal
-files. `make tables` reads what is there.
+without those that the others tell, and each in the form that takes least room: as text, as doubles,
+or as six digits with an exponent. Packing again adds seeds to those that are there; equal runs give
+equal files. `make tables` reads what is there.
 """
 
 import argparse

@@ -109,7 +109,7 @@ def beside_the_first(first: Sequence[Answer], second: Sequence[Answer]) -> str:
 
 
 def reduce_colours(picture: Path) -> None:
-    """Keep the 256 colours of a PNG file that lie nearest: two fifths of the bytes."""
+    """Keep the 256 colours of a PNG file that lie nearest, in less than half the bytes."""
     with Image.open(picture) as image:
         reduced = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     reduced.save(picture, optimize=True)
