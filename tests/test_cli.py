@@ -200,9 +200,9 @@ def test_nobody_has_to_watch_a_training(tmp_path, shown):
     else:
         terminal = end = os.open(os.devnull, os.O_RDWR)
     streams = dict.fromkeys(("stdin", "stdout", "stderr"), end)
-    settings = {"cwd": tmp_path, "env": environment, "start_new_session": True}
-    # Bash makes a terminal its own before it can read a `trap`, so the hang-up may come before it.
-    settings["preexec_fn"] = functools.partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
+    # No `trap`: Bash makes a terminal its own before it reads one, so the hang-up can come first.
+    deaf = functools.partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
+    settings = {"cwd": tmp_path, "env": environment, "start_new_session": True, "preexec_fn": deaf}
     with subprocess.Popen(["bash", "-c", f"{command} {shown}"], **settings, **streams) as process:
         os.close(terminal)
     assert (process.returncode, files(tmp_path / "run")) == (0, sorted(RESULTS))
