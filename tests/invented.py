@@ -13,7 +13,7 @@ from mace_rl.study.claims_config import parse_claims, parts_of
 from mace_rl.study.compare.aggregate import SCORED
 from mace_rl.study.compare.ledger import Finding
 from mace_rl.study.config import read_study
-from mace_rl.study.measure.betas import CORRELATION
+from mace_rl.study.measure.betas import BEFORE, CORRELATION
 from mace_rl.study.measure.metrics import LearningCurve, Metric, final_return, metrics_columns
 from mace_rl.study.metrics_config import MetricsConfig
 
@@ -34,6 +34,7 @@ LITERAL, ROBUST = CLAIMS.ways
 by_rule = PAPERS.model_dump() | {"rule": 2}
 by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be asked"
 BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
+WORLDS = parse_claims(ROOT / STUDY.claims)  # with questions of three variants, by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
 QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
 FEW = {"bootstrap_repetitions": 1000}
@@ -126,7 +127,7 @@ def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> p
             if env == "Acrobot-v1":
                 row[name] = -500 + share * 415
         if variant == "mace_full":
-            row[CORRELATION] = advantage[variant] + noise * draws.normal()
+            row[CORRELATION] = row[BEFORE] = advantage[variant] + noise * draws.normal()
         rows.append(row)
     return pd.DataFrame(rows)
 

@@ -1,6 +1,7 @@
 """What several test files share: an independent derivative, environments, runs, the command."""
 
 import copy
+import itertools
 import json
 import re
 import sys
@@ -16,6 +17,10 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import VectorEnv
+from matplotlib.axis import XAxis, YAxis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from mace_rl import cli
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
@@ -241,3 +246,22 @@ class Bonanza(gymnasium.Env):
         add = {self.where: self.value if (self.resets, self.steps) == (5, 3) else 0.0}
         state = self.np_random.random(2) + add.get("observation", 0.0)
         return state.astype(np.float32), action + add.get("reward", 0.0), False, False, {}
+
+
+def illegible(figure: Figure) -> list[tuple[str, ...]]:
+    """Words of a figure that lie on each other, in pairs, or that its edge cuts off."""
+    FigureCanvasAgg(figure).draw()  # lays it out, and makes the ticks
+    unseen: list[Text] = []
+    for axis in (*figure.findobj(XAxis), *figure.findobj(YAxis)):
+        low, high = sorted(axis.get_view_interval()) if axis.axes.axison else (1, 0)
+        for tick in axis.get_major_ticks():
+            if not low <= tick.get_loc() <= high:
+                unseen += (tick.label1, tick.label2)
+        if not axis.axes.axison:
+            unseen.append(axis.label)
+    words = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text()]
+    shown = [(text.get_text(), text.get_window_extent()) for text in words if text not in unseen]
+    cut = [(word,) for word, box in shown if not figure.bbox.padded(1).contains(*box.min)]
+    cut += [(word,) for word, box in shown if not figure.bbox.padded(1).contains(*box.max)]
+    pairs = itertools.combinations(shown, 2)
+    return cut + [(one, two) for (one, a), (two, b) in pairs if a.padded(-1).overlaps(b.padded(-1))]

@@ -3,17 +3,20 @@
 import itertools
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
 from invented import BY_SIZE, CLAIMS, ENVIRONMENTS, ROBUST, STUDY, VARIANTS, table_for_claims
-from shared import message
+from matplotlib.figure import Figure
+from shared import illegible, message
 
 from mace_rl.study.compare import draw as d
 from mace_rl.study.compare.ledger import to_json
 from mace_rl.study.compare.verdicts import ledger
+from mace_rl.study.show.curves import save_figure
 from tools import worlds
 
 TABLE1 = CLAIMS.table1
@@ -112,6 +115,13 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
         cells = itertools.product(ENVIRONMENTS, VARIANTS)
         curves = [pd.DataFrame({"env": env, "variant": name, **columns}) for env, name in cells]
         pd.concat(curves).to_csv(folder / "figure1.csv", index=False)
+    figures: list[Figure] = []
+
+    def save(figure: Figure, path: Path) -> None:
+        figures.append(figure)
+        save_figure(figure, path)
+
+    monkeypatch.setattr(worlds, "save_figure", save)
     assert set(worlds.make(tmp_path)) == {path.name for path in (tmp_path / "worlds").iterdir()}
     found = pd.read_csv(tmp_path / "worlds/verdicts.csv").query("measured == @ROBUST")
     found = found.set_index(["claim", "world"])
@@ -132,6 +142,8 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
         own = pd.read_csv(tmp_path / f"published/{name}.csv")
         own[own["env"] == "Acrobot-v1"].to_csv(tmp_path / f"published/{name}.csv")
     worlds.make(tmp_path)
+    assert len(figures) == 6
+    assert [illegible(figure) for figure in figures] == [[]] * 6
     page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
     found = re.findall(r"\| (tuned|published) \| \d+ of (\d+) \| \d+ \| \S+ \| (\d) \|", page)
     assert found == [("tuned", "18", "4"), ("published", "6", "1")]

@@ -31,7 +31,8 @@ OUTCOMES = {
 }
 NO_ROOM = {"no_room": ("#cc78bc", "no room for an effect worth mentioning")}  # the second rule's
 INK = "#262626"  # as seaborn draws axes
-LINE = 0.75  # the height of a line of words, where a part has 1
+LINE = 0.6  # the height of a line of words, where a part has 1
+LETTERS = 141  # of small words, as many as stand side by side in a picture
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
@@ -139,7 +140,7 @@ def draw_solved(table: pd.DataFrame, look: PlotStyle) -> Figure:
         cells = {"size": "small", "color": "#111111"}
         seaborn.heatmap(share, ax=axes, annot=text, fmt="", annot_kws=cells, **how)
         axes.set(xlabel="", ylabel="")
-        axes.set_yticks(axes.get_yticks(), [look.labels[name] for name in share.index])
+        axes.set_yticks(axes.get_yticks(), [look.labels[name] for name in share.index], rotation=0)
         axes.set_xticks(axes.get_xticks(), share.columns, rotation=25, ha="left")
         axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False, left=False)
         explained = f"solve at least {100 * SOLVED:g} % of the last episodes"
@@ -178,25 +179,26 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
         words += [name.partition("-")[0] for name in part.environments]
     if any(other.metric != part.metric for other in parts):
         words.append(metric_labels(source.settings).get(part.metric, part.metric).lower())
+    called = source.claims.variants
     if part.baseline:
-        words.append(f"over {source.claims.variants.get(part.baseline, part.baseline)}")
+        over = f"over {called.get(part.baseline, part.baseline)}"
+        differ = any(other.variant != part.variant for other in parts)
+        words.append(f"{called.get(part.variant, part.variant)} {over}" if differ else over)
     return ", ".join(words)
 
 
 def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
-    """A line per part, a panel per way of measuring; a claim's verdict stands at its right."""
-    small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
+    """A line per part, a panel per way of measuring; above a claim's parts it and its verdict."""
+    small: dict[str, Any] = {"fontsize": "x-small"}
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
     hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
     by_size = "size" in table
     outcomes, unit = (OUTCOMES | NO_ROOM, "the margin") if by_size else (OUTCOMES, UNIT)
     ends = table[["low", "high", "difference", "paper"]].abs()
-    reach = max(1, np.nanmax(ends.to_numpy()))
-    claims = table.groupby("claim", sort=False)[["claim", "statement"]].first()
-    width = 20 if table["measured"].nunique() > 1 else 40  # letters, beside what the parts are
-    said = {str(name): wrapped(" ".join(own), width) for name, own in claims.T.items()}
-    table, blocks = _placed(table, {name: len(text.splitlines()) for name, text in said.items()})
-    count, ways = max(end for _, end in blocks.values()), table["measured"].unique()
+    reach = 1.1 * max(1, np.nanmax(ends.to_numpy()))
+    ways = table["measured"].unique()
+    said, table, blocks = _placed(table, LETTERS // (1 + len(ways)))
+    count = max(end for _, end in blocks.values())
     with style():
         height = 0.2 * count + LEGEND_HEIGHT
         figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
@@ -213,20 +215,18 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
-            axes.set(title=str(how).capitalize(), xlim=(-1.1 * reach, 1.8 * reach), yticks=[])
+            axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
             axes.set_xlabel(f"Difference in favour of what is said\n(1: {unit})")
-            for shade, (_, claim) in enumerate(own.groupby("claim", sort=False)):
-                name = claim["claim"].iloc[0]
-                top, end = blocks[name]
+            for name, claim in own.groupby("claim", sort=False):
                 (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
-                colour, _ = outcomes[answer]
-                axes.text(1.8 * reach, top + 0.5, verdict, color=colour, ha="right", **small)
-                for panel in (names, axes):
-                    panel.axhspan(top, end, color="0.9" if shade % 2 else "white", zorder=0)
-                if how == ways[-1]:
-                    names.text(0, (top + end) / 2, said[name], **small)
-                    for place, part in zip(claim["place"], claim["part"], strict=True):
-                        names.text(1, place, part, ha="right", **small)
+                top, colour = blocks[str(name)][0] + 0.2, outcomes[answer][0]
+                axes.text(reach, top, verdict, color=colour, ha="right", va="top", **small)
+        for shade, (name, (top, end)) in enumerate(blocks.items()):
+            for panel in (names, *panels):
+                panel.axhspan(top, end, color="0.9" if shade % 2 else "white", zorder=0)
+            names.text(0, top + 0.2, said[name], va="top", **small)
+        for _, row in table.drop_duplicates(["claim", "part"]).iterrows():
+            names.text(1, row["place"], row["words"], ha="right", va="center", **small)
         names.set_axis_off()
         for panel in (names, *panels):
             panel.set_ylim(count, 0)
@@ -242,17 +242,23 @@ def wrapped(words: str, width: int) -> str:
 
 
 def _placed(
-    table: pd.DataFrame, lines: Mapping[str, int]
-) -> tuple[pd.DataFrame, dict[str, tuple[float, float]]]:
-    """The parts with their `place` from the top, and each claim's ends; lines: of its text."""
-    end, blocks, placed = 0.0, {}, []
+    table: pd.DataFrame, width: int
+) -> tuple[dict[str, str], pd.DataFrame, dict[str, tuple[float, float]]]:
+    """What each claim says in lines of so many letters; the parts, and where they are; its ends.
+
+    The parts have their `words`, in such lines too, and their `place` from the top.
+    """
+    table = table.assign(words=table["part"].map(lambda part: wrapped(part, width)))
+    end, said, blocks, placed = 0.0, {}, {}, []
     for name, claim in table.groupby("claim", sort=False):
-        order = claim.groupby("measured").cumcount()
-        parts = order.max() + 1
-        start, end = end, end + max(parts, LINE * lines[str(name)])
+        said[str(name)] = wrapped(f"{name} {claim['statement'].iloc[0]}", width)
+        start, end = end, end + 0.3 + LINE * len(said[str(name)].splitlines())
+        for _, ways in claim.groupby("part", sort=False):
+            height = max(1.0, LINE * len(ways["words"].iloc[0].splitlines()))
+            placed.append(pd.Series(end + height / 2, ways.index))
+            end += height
         blocks[str(name)] = start, end
-        placed.append((start + end - parts + 1) / 2 + order)
-    return table.assign(place=pd.concat(placed)), blocks
+    return said, table.assign(place=pd.concat(placed)), blocks
 
 
 def readings(source: Source) -> pd.DataFrame:

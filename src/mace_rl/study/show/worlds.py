@@ -23,6 +23,7 @@ from mace_rl.study.show.curves import (
 from mace_rl.study.show.pictures import INK, NO_ROOM, OUTCOMES, wrapped
 
 LINE = 0.15  # inches
+SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
 # From seaborn's palette that the colour-blind can tell apart; none is a verdict's.
 COLOURS = ("#949494", "#56b4e9", "#ca9161")
 
@@ -117,10 +118,14 @@ def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: P
                 ends = middle - len(runs) / 2, middle + len(runs) / 2
                 paper = table1.values[env][variant][column]
                 axes.vlines(paper, *ends, color=INK, linewidth=1.3, label="the paper's number")
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter("{x:.0f}")
-            axes.minorticks_off()
+            least, most = axes.dataLim.intervalx
+            if most > SEVERAL * least:
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter("{x:.0f}")
+                axes.minorticks_off()
+            else:
+                axes.locator_params(axis="x", nbins=4)
             axes.set_title(f"{env}: {look.metrics[metric].lower()}")
             names = ["" if column else look.labels[name] for name in table1.variants]
             axes.set_yticks(middles, names)
