@@ -87,9 +87,6 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         axes.set_xticks(np.arange(len(worlds)) + 0.485, worlds)
         axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False)
         axes.spines[:].set_visible(False)
-        for outcome in table["outcome"].unique():
-            colour, label = colours[outcome]
-            axes.fill_between([], [], color=colour, alpha=0.25, linewidth=0, label=label)
         legend(figure, "A margin is what would be worth mentioning.")
     return figure
 
