@@ -2,6 +2,7 @@
 
 import html
 import math
+from dataclasses import replace
 from itertools import product
 
 import matplotlib
@@ -13,6 +14,7 @@ from invented import (
     BY_SIZE,
     CLAIMS,
     QUESTIONED,
+    ROBUST,
     SEEDS,
     STUDY,
     WORLDS,
@@ -241,6 +243,15 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
             assert np.isnan(row["paper"]) == np.isnan(part.in_paper)
             assert row["outcome"] == part.outcome and row["answer"] == judged.outcome
         assert not rows.duplicated(["claim", "part"]).any()  # the words tell parts from each other
+
+
+def test_a_part_that_has_nothing_to_be_told_from_is_called_by_its_metric(ledgers, settings):
+    [answer] = [one for one in ledgers[3] if one.claim == "C9"]
+    judged = answer.ways[ROBUST]
+    alone = replace(judged, parts=judged.parts[:1])
+    answer = replace(answer, ways={ROBUST: alone})
+    table = PICTURES["forest"].data(Source({}, [answer], settings, CLAIMS))
+    assert list(table["part"]) == ["stagnation_correlation_before"]
 
 
 @pytest.mark.parametrize(

@@ -173,18 +173,19 @@ def forest(source: Source) -> pd.DataFrame:
 
 
 def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
-    """What tells a part from the others of its claim."""
+    """What tells a part from the others of its claim; the metric where it has no others."""
     words = []
+    metric = metric_labels(source.settings).get(part.metric, part.metric).lower()
     if any(other.environments != part.environments for other in parts):
         words += [name.partition("-")[0] for name in part.environments]
     if any(other.metric != part.metric for other in parts):
-        words.append(metric_labels(source.settings).get(part.metric, part.metric).lower())
+        words.append(metric)
     called = source.claims.variants
     if part.baseline:
         over = f"over {called.get(part.baseline, part.baseline)}"
         differ = any(other.variant != part.variant for other in parts)
         words.append(f"{called.get(part.variant, part.variant)} {over}" if differ else over)
-    return ", ".join(words)
+    return ", ".join(words) or metric
 
 
 def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
