@@ -32,7 +32,7 @@ OUTCOMES = {
 NO_ROOM = {"no_room": ("#cc78bc", "no room for an effect worth mentioning")}  # the second rule's
 INK = "#262626"  # as seaborn draws axes
 LINE = 0.6  # the height of a line of words, where a part has 1
-LETTERS = 141  # of small words, as many as stand side by side in a picture
+SMALL_LETTERS = 141  # of the smallest words, as many as stand side by side in a picture
 UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
@@ -198,7 +198,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     ends = table[["low", "high", "difference", "paper"]].abs()
     reach = 1.1 * max(1, np.nanmax(ends.to_numpy()))
     ways = table["measured"].unique()
-    said, table, blocks = _placed(table, LETTERS // (1 + len(ways)))
+    said, table, blocks = _placed(table, SMALL_LETTERS // (1 + len(ways)))
     count = max(end for _, end in blocks.values())
     with style():
         height = 0.2 * count + LEGEND_HEIGHT
