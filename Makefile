@@ -49,14 +49,14 @@ test-wheel: setup ## the wheel in environments of its own: newest, lowest, Debia
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables $(if $(CI),--check)
 
-report: setup ## one page of a kept study, without training: verdicts, figures, agents (STUDY=study)
+report: setup ## one page of a kept study, without training: verdicts and figures (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)
 
 bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour; BENCH=quick: a few)
 	@$(call one_of,BENCH,quick)
 	@$(IN_VENV) benchmarks $(if $(BENCH),--quick)
 
-verify: setup ## repeat a sample of the nine short runs and one of each kept world, and compare to the bit (SAMPLE=3)
+verify: setup ## repeat some of the nine short runs, one each of tuned, plain, our tasks: to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 	folder=$$(mktemp -d)
 	trap 'rm -rf "$$folder"' EXIT

@@ -313,7 +313,7 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     assert "10 not reproduced, 0 open, 0 could not be asked" in shown and "docs/metrics.md" in shown
     part = by_size[0].ways[ROBUST].parts[0]
     ends = " to ".join(number(end) for end in (part.predicted_low, part.predicted_high))
-    assert f"| {number(part.room)} | {ends} | {part.replication} | small | absent |" in shown
+    assert f"| {number(part.room, 1)} | {ends} | {part.replication} | small | absent |" in shown
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
     alone = {name: make(runs.iloc[:10], QUICK) for name, make in kinds.items()}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}

@@ -73,7 +73,7 @@ def records(table: pd.DataFrame) -> Any:
 
 def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]:
     """The tables in words, for README.md."""
-    said = "{verdict}; {shown} of {parts} shown; room {least_room:.2g} to {most_room:.2g}"
+    said = "{verdict}; {shown} of {parts} shown; room {least_room:.3g} to {most_room:.3g}"
     sections = []
     for way, own in tables["verdicts"].groupby("measured") if "verdicts" in tables else ():
         rows: Any = own.to_dict("records")

@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
     over = "YAML files read over the default settings, one after the other"
     add("--config", type=Path, **several, help=over)
-    slower = "of every network: compiled (default) or plain PyTorch, slower, to check it by"
+    slower = "of policy and critics: compiled (default) or plain PyTorch, slower, to check it by"
     add("--engine", choices=["compiled", "torch"], help=slower)
     add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
     anew = "move a run that is in the folder into a folder below it, and train from the start"

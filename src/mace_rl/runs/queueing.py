@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from mace_rl.config.run import RunConfig
 
 START_SECONDS = 120.0  # Snakemake's start on the node; imports from a shared disk
-# Steps of plain PPO a second: a third to a sixth of docs/performance.md's, for older processors.
+# Steps of plain PPO a second: a third to an eighth of docs/performance.md's, for older processors.
 STEPS_PER_SECOND = 3_000.0
 IN_COMPILED_CODE = {"CartPole-v1": 30_000.0, "Acrobot-v1": 30_000.0}
 IN_TORCH = 300.0

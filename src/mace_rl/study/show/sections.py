@@ -78,7 +78,7 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
         verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
         page = "metrics" if claims.rule == 2 else "protocol"
         note = f"Of {len(own)}, {verdicts}. The rule: docs/{page}.md."
-        yield Section(title.capitalize(), note, tables.verdicts(own))
+        yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
             yield Section(f"Part by part: {how}", PARTS_BY_RULE[claims.rule], frame, level=3)

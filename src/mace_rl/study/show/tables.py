@@ -229,7 +229,7 @@ def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
     ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
     chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
     outcome = part.outcome.replace("_", " ")
-    return [_number(part.room, digits), chance, part.replication, part.size, outcome]
+    return [_number(part.room, max(1, digits)), chance, part.replication, part.size, outcome]
 
 
 def costs(

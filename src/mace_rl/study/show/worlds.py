@@ -73,7 +73,7 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
             colour, _ = colours[row.outcome]
             size = f", {row.worth} worth mentioning" if row.shown else ""
             room = " to ".join(
-                dict.fromkeys(f"{one:.2g}" for one in (row.least_room, row.most_room))
+                dict.fromkeys(f"{one:.3g}" for one in (row.least_room, row.most_room))
             )
             lines = f"{row.verdict}\n{row.shown} of {row.parts} shown{size}\nroom: {room} margins"
             area = (
