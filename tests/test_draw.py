@@ -134,8 +134,15 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
             assert row["worth"] == sum(part.size == "worth mentioning" for part in shown)
     assert found.loc[("C1", "plain"), ["shown", "worth"]].tolist() == [2, 2]
     page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
-    row, _ = re.findall(r"\| C1 \|.*", page)  # robust, and by the paper's words
+    row, _, *each = re.findall(r"\| C1 \|.*", page)  # robust, by the paper's words, its two parts
     assert row.count("reproduced; 2 of 2 shown") == 1 and row.count("; 0 of 2 shown") == 2
+    for number, cells in enumerate(line.split(" | ")[4:] for line in each):
+        for cell, answers in zip(cells, ledgers.values(), strict=True):
+            part = answers[0].ways[ROBUST].parts[number]
+            numbers = [part.difference, part.low, part.high, part.seeds, part.worth_mentioning]
+            text = "{:z.0f} ({:z.0f} to {:z.0f}); n {:.0f}, room [0-9.]+, margin {:.0f}, .*: {}"
+            said = text.format(*numbers, part.outcome.replace("_", " "))
+            assert re.match(re.sub(r"[()]", r"\\\g<0>", said), cell.replace("−", "-"))
     (tmp_path / "tuned/claims.json").unlink()  # as while Hopper's runs are not all there
     shutil.rmtree(tmp_path / "plain")
     for name in ("metrics", "figure1"):  # nor even CartPole's

@@ -23,11 +23,13 @@ from mace_rl.study.show import worlds
 from mace_rl.study.show.curves import PlotStyle, plot_style, quantity, save_figure
 from mace_rl.study.show.markdown import page
 from mace_rl.study.show.sections import Section
+from mace_rl.study.show.tables import side_by_side
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
 CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
 DECIDES = "robust"  # the way to measure that is pictured
 COMMAND = "`python -m tools.worlds`"
+RULE = "[second rule](../../../docs/metrics.md#the-second-rule)"
 
 
 def make(folder: Path) -> list[str]:
@@ -61,7 +63,12 @@ def make(folder: Path) -> list[str]:
     for name, picture in pictures.items():
         save_figure(picture, goal / f"{name}.png")
     origin = f"From {', '.join(f'[{world}](../{world})' for world in there)}, by {COMMAND}."
-    text = page("worlds", origin, _sections(tables, look), list(pictures))
+    sections = _sections(tables, look)
+    if answers:
+        note = f"Difference in the claim's favour, 95 % interval, and what the {RULE} says of it."
+        found = side_by_side(answers, DECIDES)
+        sections.append(Section(f"Part by part: {DECIDES}", note, found))
+    text = page("worlds", origin, sections, list(pictures))
     (goal / "README.md").write_text(text, encoding="utf-8")
     return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
 

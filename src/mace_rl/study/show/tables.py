@@ -19,6 +19,7 @@ from mace_rl.study.metrics_config import MetricsConfig
 
 COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
 DASH = "\u2013"  # in the place of a number that there is not
+SIZES = ("room", "margin", "detectable")  # beside a difference
 CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
@@ -230,6 +231,22 @@ def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
     chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
     outcome = part.outcome.replace("_", " ")
     return [_number(part.room, max(1, digits)), chance, part.replication, part.size, outcome]
+
+
+def side_by_side(studies: Mapping[str, Sequence[Answer]], how: str) -> pd.DataFrame:
+    """`parts` of several studies by the second rule, in short, each study in a column."""
+    part, columns = ["", "environment", "metric", "over"], []
+    for answers in studies.values():
+        frame = parts(answers, how, {})
+        frame = frame.set_axis([*part, *frame.columns[4:-1], "outcome"], axis=1).set_index(part)
+        columns.append(pd.Series([_in_short(row) for _, row in frame.iterrows()], frame.index))
+    return pd.concat(columns, axis=1, keys=studies, sort=False).fillna("").reset_index()
+
+
+def _in_short(part: pd.Series) -> Cell:
+    size = f", {part['size']}" if part["outcome"] in ("shown", "reversed") else ""
+    numbers = (f"{name} {part[name].values[0].text}" for name in ("n", *SIZES))
+    return part["difference"]._replace(note=f"{', '.join(numbers)}: {part['outcome']}{size}")
 
 
 def costs(
