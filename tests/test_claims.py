@@ -154,6 +154,15 @@ def test_a_part_is_what_paired_statistics_say() -> None:
     assert verdicts.ledger(frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
 
 
+def test_a_reading_is_of_the_metric_with_the_longest_name_that_it_begins_with() -> None:
+    rows = {"Own-v0": {key: [100, 900] for key in PAPERS.table1.variants}}
+    own = {"metrics": ["convergence_steps", "convergence_steps_range"], "values": rows}
+    table1 = PAPERS.table1.model_copy(update=own)
+    for reading, expected in (("convergence_steps_range_2", {900}), ("convergence_steps_r", {100})):
+        assert {*table1.values_of(["Own-v0"], reading).values()} == expected
+    assert table1.values_of(["Own-v0"], "convergence") == {}
+
+
 def test_a_seed_that_one_variant_lacks_is_an_error() -> None:
     frame = table_for_claims(12, PLAIN, noise=0.02)
     own = (frame["env"] == "CartPole-v1") & (frame["variant"] == "ppo") & (frame["seed"] == 5)

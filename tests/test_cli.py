@@ -151,7 +151,8 @@ UNFIT = {  # an option's value, and what would be right
     ("watch", "--seconds", "nan"): "nan, but should be greater than 0",
     ("watch", "--width", "2001"): "2001, but should be from 50 to 2000",
     ("evaluate", "--episodes", "-3"): "-3, but should be at least 1",
-    ("evaluate", "--seed", "-1"): "-1, but should be at least 0",
+    ("evaluate", "--seed", "-1"): "-1, but should be from 0 to 4294967295",
+    ("watch", "--seed", "4294967296"): "4294967296, but should be from 0 to 4294967295",
     ("verify", "--sample", "0"): "0, but should be at least 1",
 }
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from shared import ROOT, call, refusal
 from tensorboardX.proto.event_pb2 import Event
 
@@ -147,6 +148,22 @@ def test_events_of_a_run_that_is_not_finished(run_config, monkeypatch, tmp_path)
         returns = [float(np.float32(record.extrinsic_return)) for record in trainer.records]
         assert found["episodes/extrinsic_return"] == list(enumerate(returns, start=1))
         assert len(returns) == len(found["updates/entropy"]) == count
+
+
+UNEVEN = {"episode": torch.arange(2), "beta": torch.zeros(3)}
+NO_TRAINERS = [
+    3,
+    {},
+    {"records": {"episode": 3}},
+    dict.fromkeys(("records", "diagnostics"), UNEVEN),
+]
+
+
+@pytest.mark.parametrize("trainer", NO_TRAINERS, ids=str)
+def test_a_checkpoint_that_no_training_wrote(trainer, monkeypatch, tmp_path):
+    checkpoint.save(tmp_path / files.CHECKPOINT, {}, {"trainer": trainer})
+    said = refusal(monkeypatch, "tensorboard", str(tmp_path))
+    assert said.endswith(f"{files.CHECKPOINT}: not as a training writes it")
 
 
 def test_without_the_package_one_line_says_so(run, monkeypatch):

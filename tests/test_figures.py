@@ -92,6 +92,16 @@ def test_mean_curves_against_scipy_point_by_point(shown):
         assert (row.lower, row.upper) == pytest.approx(tuple(expected))
 
 
+def test_a_beta_above_1_is_within_its_interval_and_the_panel():
+    runs = {run: frame.assign(beta=frame["beta"] * 4) for run, frame in frames().items()}
+    curves, single = data(BETA, runs)
+    assert single["beta"].max() > 3 and curves["upper"].max() > 2
+    assert (curves["mean"] <= curves["upper"]).all() and (curves["lower"] >= 0).all()
+    assert [axes.get_ylim() for axes in draw(shown=BETA, runs=runs).axes] == [
+        (0, single[single["env"] == name]["beta"].max()) for name in ("A-v0", "B-v1")
+    ]
+
+
 def test_seeds_of_different_lengths_are_refused():
     runs = frames()
     runs["B-v1", "ppo", 1] = runs["B-v1", "ppo", 1].iloc[:-1]

@@ -97,6 +97,8 @@ MISTAKES = {
     "ppo.network.arguments.d is {1}": {"ppo": {"network": OWN | MODULE}},
     "--max-episode-steps": {"environment": "Blackjack-v1"},
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
+    "the changes has the section 'memory', which": {"variant": "ppo", "memory": {"capacty": 3}},
+    "the section 'meta', which a variant with beta.kind": {"variant": "mace_fixed", "meta": {}},
 }
 
 

@@ -178,14 +178,30 @@ def test_a_loaded_policy_knows_its_space(name, one):
 # --- Films ----------------------------------------------------------------------------------------
 
 
+class Chance(gymnasium.Wrapper):
+    """Rewards by a generator of its own."""
+
+    def __init__(self, **arguments):
+        super().__init__(CartPoleEnv(**arguments))
+
+    def reset(self, *, seed=None, options=None):
+        self.draws = self.draws if seed is None else np.random.default_rng(seed)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        state, _, *rest = self.env.step(action)
+        return state, self.draws.random(), *rest
+
+
 class NoDisplay(CartPoleEnv):
     def render(self):
         raise OSError("no display")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0"])
-def test_what_is_filmed_is_what_evaluate_plays(trained, environment):
+@pytest.mark.parametrize("environment", ["CartPole-v1", "HopperBulletEnv-v0", "Chance-v0"])
+def test_what_is_filmed_is_what_evaluate_plays(trained, register, environment):
+    register("Chance-v0", Chance)
     folder = trained(environment, episodes=2)
     threshold = gc.get_threshold()
     gc.set_threshold(10)  # what is no longer used goes while the film is made

@@ -11,7 +11,7 @@ import pytest
 
 from mace_rl.config.section import ConfigError
 from mace_rl.runs import progress
-from mace_rl.runs.progress import Run, duration, seconds_left, status
+from mace_rl.runs.progress import Planned, Run, duration, seconds_left, status
 
 nan = math.nan
 
@@ -75,6 +75,22 @@ def test_the_table(tmp_path: Path) -> None:
     ]
 
 
+def test_what_is_damaged_is_named(tmp_path: Path) -> None:
+    folder = Folder(tmp_path, cores=2)
+    for said, path in (("record", "A/ppo/seed0/run"), ("told", "B/ppo/seed0/progress")):
+        folder.plan["runs"] = []
+        folder.add(path[0], **{said: '{"episode": 4}'})
+        with pytest.raises(ConfigError, match=rf"{path}\.json: the key 'seconds' is missing"):
+            folder.lines()
+    for text in ('{"cores": 2, "runs": [', "\udcff"):
+        (tmp_path / "logs" / "plan.json").write_bytes(text.encode(errors="surrogateescape"))
+        with pytest.raises(ConfigError, match=r"logs/plan\.json: cut off or altered"):
+            status(tmp_path)
+    folder.plan["runs"] = [{"env": "A"}]
+    with pytest.raises(ConfigError, match=r"logs/plan\.json: the key 'runs.0.variant' is missing"):
+        folder.lines()
+
+
 # Runs (environment, work, what there is of it), cores, and the seconds to the end of all.
 DONE_A, DONE_B = ({"env": env, "record": DONE} for env in "AB")
 CASES = [
@@ -96,7 +112,7 @@ def test_seconds_left_by_hand(tmp_path: Path, runs, cores, expected, unknown) ->
     folder = Folder(tmp_path, cores)
     for run in runs:
         folder.add(**run)
-    planned = [Run(run, tmp_path, 1000.0) for run in folder.plan["runs"]]
+    planned = [Run(Planned(**run), tmp_path, 1000.0) for run in folder.plan["runs"]]
     seconds, without = seconds_left(planned, cores)
     assert (seconds, without) == (pytest.approx(expected), unknown)
 

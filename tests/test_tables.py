@@ -237,6 +237,9 @@ def test_special_characters_are_escaped_once() -> None:
         r"a\_b \& 50 \% $\beta$ \textasciitilde{} \textbackslash{}x \{1\} \#2"
         r" \$3\textasciicircum{}4 $\lambda$"
     )
+    assert (
+        escaped("Ω, ψ, ς and \u0391\u03b9\u03bf") == r"$\Omega$, $\psi$, $\varsigma$ and A$\iota$o"
+    )
 
 
 NO_LATEX = shutil.which("pdflatex") is None and "CI" not in os.environ
@@ -247,7 +250,7 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     many = metrics([*ENVIRONMENTS, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
     many["sample_efficiency"] += 1000  # four digits in every cell are the widest there are
     many["episodes"] = 6000
-    labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & β"}
+    labels = LABELS | {"mace_full": "MACE-RL (Full, Meta Network) 100 % & βςΩ\u03bf"}
     fragments = [
         table1_latex(table1(many, QUICK), labels, QUICK, CLAIMS.table1),
         table1_latex(table1(metrics(seeds=1), QUICK), {}, QUICK, CLAIMS.table1),

@@ -121,6 +121,11 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     assert tabulate("--report", "small")[0] == "results/tables/small/report.html\n"
     assert "<!DOCTYPE html>" in (tmp_path / "results/tables/small/report.html").read_text()
     assert "--report is 'none', but should be one of bad, small" in tabulate("--report", "none")[1]
+    [archive] = (tmp_path / "reference/study").rglob("*.tar.xz")
+    archive.write_bytes(archive.read_bytes()[:1000])
+    assert tabulate("--report", "small")[1].startswith(
+        "tables: reference/study/CartPole-v1/ppo.tar"
+    )
 
 
 # --- random_return --------------------------------------------------------------------------------
@@ -148,7 +153,8 @@ def test_what_has_no_random_return(monkeypatch, tmp_path, words, expected) -> No
 def test_a_random_return_is_that_of_random_actions(monkeypatch, capsys, register, tmp_path) -> None:
     """Of so many fair choices between 0 and 1 in each of 40 episodes."""
     name, short = register("Bonanza-v0", Bonanza, 1000), tmp_path / "short.yaml"
-    short.write_text(f"environment_settings: {{{name}: {{max_episode_steps: 100}}}}\n")
+    own = f"environments: [{name}]\nenvironment_seeds: {{{name}: [3]}}\n"  # not complete without
+    short.write_text(f"{own}environment_settings: {{{name}: {{max_episode_steps: 100}}}}\n")
     for steps, files in ((1000, []), (100, [str(short)])):
         monkeypatch.setattr("sys.argv", ["random_return", name, "40", *files])
         random_return.main()

@@ -145,7 +145,7 @@ def test_an_agent_that_does_not_fit_is_refused_by_the_entry(kept, message):
 READ = {  # by the command
     "evaluate": [files.AGENT],
     "watch": [files.AGENT],
-    "verify": [files.EPISODES],
+    "verify": [*files.RESULTS],
     "export": [files.EPISODES],
     "tensorboard": [files.EPISODES, files.DIAGNOSTICS],
     "train": [*files.RESULTS],
@@ -187,7 +187,8 @@ def said_of(trained, monkeypatch, tmp_path):
 @pytest.mark.parametrize(("command", "name"), [(one, name) for one in READ for name in READ[one]])
 def test_a_file_that_is_not_the_one_of_run_json(said_of, command, name):
     for content in (None, b"episode\n1\n"):
-        if content or name != files.DIAGNOSTICS or command == "train":  # kept runs are without it
+        of_a_kept_run = content or name == files.EPISODES  # it may be without the others
+        if of_a_kept_run or command in ("train", "evaluate", "watch"):
             said = said_of(command, name, content)
             assert re.search(rf"/{name}: (missing, cut off or altered|line 1: the column)", said)
 
@@ -222,7 +223,7 @@ def test_what_no_training_wrote_though_its_digest_is_right(trained, tmp_path, te
     ("section", "change", "said"),
     [
         ("config", {"seed": 1}, "different from episode 1; mean return"),
-        ("outputs", {"agent.pt": "0" * 64}, "different in the agent's weights only;"),
+        ("outputs", {"agent.pt": "0" * 64}, "different in agent.pt only;"),
         ("versions", {"numpy": "1.0"}, "versions.numpy was '1.0' and is"),
     ],
 )
@@ -233,6 +234,7 @@ def test_verify_says_what_differs(trained, tmp_path, monkeypatch, capsys, sectio
     record["machine"]["cpu"] = "Z80"
     record["config"]["seed"] = int(section != "outputs")
     record[section].update(change)
+    (run / files.AGENT).unlink()  # as in a kept run
     path.write_text(json.dumps(record), encoding="utf-8")
     expected = "mace-rl: not reproduced: 0 of 1 runs equal to the bit"
     assert call(monkeypatch, "verify", str(tmp_path)) == (1, expected)

@@ -25,13 +25,14 @@ ROOT = Path(__file__).resolve().parent.parent
 def configuration(environment: str, overlays: list[str]) -> RunConfig:
     """Of a run in `environment`, which needs no random return yet; `ConfigError` if there is none.
 
-    The study's own environments are those of config.yaml, whatever the files over it say.
+    The study's own environments and seeds are those of config.yaml, whatever the files over it say.
     """
     base = config = read_yaml(ROOT / "config.yaml")
     for overlay in overlays:
         config = merge(config, read_yaml(Path(overlay)))
     origin = " + ".join(["config.yaml", *overlays])
-    study = load_study(config | {"environments": base["environments"]}, origin)
+    own = {"environments": base["environments"], "environment_seeds": {}}
+    study = load_study(config | own, origin)
     return study.run_config(environment, "ppo", 0)
 
 

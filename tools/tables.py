@@ -152,9 +152,9 @@ def main() -> None:
     for stale in [MADE / only, *(MADE / archive for archive in archives)] if only else [MADE]:
         if stale.exists():
             shutil.rmtree(stale)
-    runs = sum(kept_runs.unpack(Path(archive), MADE / archive) for archive in archives)
     outputs = {name: [PAGE] if only else study["outputs"] for name, study in wanted.items()}
     try:
+        runs = sum(kept_runs.unpack(Path(archive), MADE / archive) for archive in archives)
         make_all(
             {name: wanted[name] | {"outputs": [*own, TABLES]} for name, own in outputs.items()}
         )

@@ -106,7 +106,8 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     wide = wide[table["world"].unique()].reset_index().fillna("")
     frame = order.merge(wide).astype({"paper": int}).map(str)
     note = (
-        "Median and central 90 % of each world's seeds. *: the paper's number is not among these."
+        "Median and central 90 % of each world's seeds. *: unusual, by its place among the seeds"
+        " ([the protocol](../../../docs/worlds-protocol.md#the-table-as-a-draw))."
     )
     sections.append(Section("The paper's numbers", note, frame))
     rows = [

@@ -103,7 +103,8 @@ def _require_at_least(smallest: int, arguments: argparse.Namespace, *names: str)
 
 def _require_playable(arguments: argparse.Namespace) -> None:
     _require_at_least(1, arguments, "episodes")
-    _require_at_least(0, arguments, "seed")
+    seed = arguments.seed
+    _require(0 <= seed < 2**32, "--seed", seed, "be from 0 to 4294967295")
     # Before PyTorch, which takes seconds.
     _ = FinishedRun(arguments.folder, arguments.trust).agent_config
 

@@ -12,7 +12,7 @@ from mace_rl.files import write_atomically
 from mace_rl.records import RecordError
 from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint
-from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.finished import NEVER_WRITTEN, FinishedRun
 
 
 def write_all(folder: Path, out: Path) -> int:
@@ -52,23 +52,33 @@ def write(run: Path, out: Path) -> None:
 
 
 def read(run: Path) -> dict[str, pd.DataFrame]:
-    """The tables of a run, from its files or its checkpoint, by the prefix of their tags."""
+    """The tables of a run by the prefix of their tags, with the episode as their index.
+
+    From its files or its checkpoint; raises what their reading raises.
+    """
     if (run / files.RECORD).exists():
         finished = FinishedRun(run)
-        tables = {"episodes": finished.episodes, "updates": finished.diagnostics}
-        return {prefix: table for prefix, table in tables.items() if table is not None}
-    state = checkpoint.read(run / files.CHECKPOINT)["state"]["trainer"]
-    return {
-        prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
-        for prefix, key in (("episodes", "records"), ("updates", "diagnostics"))
-    }
+        both = {"episodes": finished.episodes, "updates": finished.diagnostics}
+        there = {prefix: table for prefix, table in both.items() if table is not None}
+        return {prefix: table.set_index("episode") for prefix, table in there.items()}
+    found = checkpoint.read(run / files.CHECKPOINT)
+    try:
+        state = found["state"]["trainer"]
+        tables = {
+            prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
+            for prefix, key in (("episodes", "records"), ("updates", "diagnostics"))
+        }
+        return {prefix: table.set_index("episode") for prefix, table in tables.items()}
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError):
+        path = run / files.CHECKPOINT
+        raise checkpoint.CheckpointError(f"{path}: {NEVER_WRITTEN}") from None
 
 
 def rows(tables: Mapping[str, pd.DataFrame]) -> list[tuple[int, dict[str, float]]]:
     """Each row's episode and its values by tag, without NaN, in the order of episodes."""
     found: list[Any] = []
     for prefix, table in tables.items():
-        values = table.set_index("episode").drop(columns="update", errors="ignore")
+        values = table.drop(columns="update", errors="ignore")
         tagged = values.add_prefix(f"{prefix}/").iterrows()
         found += [(episode, row.dropna().to_dict()) for episode, row in tagged]
     return sorted(found, key=lambda row: row[0])  # stable: episodes before their update

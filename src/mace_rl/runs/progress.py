@@ -15,11 +15,48 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, TextIO
 
+from pydantic import BaseModel
+
 from mace_rl import files
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, check
 
 FILE_SECONDS = 30.0  # between the lines of `line` in a file
 EARLY = 0.1  # the share of its episodes before which a run's own estimate would be a guess
+
+
+class Planned(BaseModel):
+    """A run of the workflow's plan."""
+
+    env: str
+    variant: str
+    seed: int
+    work: float  # relative duration among runs of its environment
+    due: bool
+
+
+class Plan(BaseModel):
+    """The workflow's plan."""
+
+    cores: int | None
+    runs: list[Planned]
+
+
+class Record(BaseModel):
+    """What is needed of a run.json."""
+
+    seconds: float
+    start_seconds: float
+
+
+class Told(Record):
+    """What is needed of a run's progress."""
+
+    episode: int
+    episodes: int
+    recent_return: float
+    beta: float
+    steps_per_second: float
+    left: float
 
 
 def cells(told: Mapping[str, Any]) -> dict[str, str]:
@@ -75,16 +112,17 @@ def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
 
 def status(results: Path) -> list[str]:
     """The lines of `mace-rl status`, about the runs that the workflow in `results` planned."""
-    try:
-        plan = json.loads((results / files.PLAN).read_bytes())
-    except FileNotFoundError:
-        raise ConfigError(f"{results}: no workflow has begun here: no {files.PLAN}") from None
-    began = (results / files.PLAN).stat().st_mtime
-    runs = [Run(run, results, began) for run in plan["runs"]]
+    path = results / files.PLAN
+    if not path.exists():
+        raise ConfigError(f"{results}: no workflow has begun here: no {files.PLAN}")
+    if (found := read(path, 0.0, Plan)) is None:
+        raise ConfigError(f"{path}: cut off or altered; the workflow's next start writes it anew")
+    plan = Plan(**found)
+    runs = [Run(run, results, path.stat().st_mtime) for run in plan.runs]
     states = Counter(run.state for run in runs)
     counts = [f"{states[state]} {state}" for state in ("running", "waiting", "stopped")]
     shown = [f"{states['done']} of {len(runs)} runs done", *(c for c in counts if c[:2] != "0 ")]
-    left, unknown = seconds_left(runs, plan["cores"] or states["running"])
+    left, unknown = seconds_left(runs, plan.cores or states["running"])
     heading = ", ".join(shown)
     if states["running"]:
         heading += f"; about {duration(left)} left" if left else "; time left not known yet"
@@ -98,12 +136,13 @@ def status(results: Path) -> list[str]:
 class Run:
     """One training run of a plan, as its folder shows it now."""
 
-    def __init__(self, planned: Mapping[str, Any], results: Path, began: float) -> None:
-        self.env, self.variant, self.seed = planned["env"], planned["variant"], planned["seed"]
-        self.work = planned["work"]  # relative duration among runs of its environment
+    def __init__(self, planned: Planned, results: Path, began: float) -> None:
+        self.env, self.variant, self.seed = planned.env, planned.variant, planned.seed
+        self.work = planned.work
         folder = results / "runs" / self.env / self.variant / f"seed{self.seed}"
-        since = began if planned["due"] else 0.0  # older files are of an earlier attempt
-        record, told = (read(folder / name, since) for name in (files.RECORD, files.PROGRESS))
+        since = began if planned.due else 0.0  # older files are of an earlier attempt
+        record = read(folder / files.RECORD, since, Record)
+        told = read(folder / files.PROGRESS, since, Told)
         self.told = told or {}
         self.seconds = math.nan  # of the whole training, if known
         if record:
@@ -129,12 +168,18 @@ class Run:
         return {"environment": self.env, "variant": self.variant, "seed": str(self.seed)} | shown
 
 
-def read(path: Path, since: float) -> Any:
-    """A JSON file that was written after `since`; None if there is none, or it is incomplete."""
+def read(path: Path, since: float, model: type[BaseModel]) -> Any:
+    """A JSON file that was written after `since`; None if there is none, or it is incomplete.
+
+    `ConfigError` if it has not what `model` has.
+    """
     try:
-        return json.loads(path.read_bytes()) if path.stat().st_mtime >= since else None
-    except (FileNotFoundError, json.JSONDecodeError):
+        content = json.loads(path.read_bytes()) if path.stat().st_mtime >= since else None
+    except (FileNotFoundError, ValueError):  # the latter also of what is no text
         return None
+    if content is not None:
+        check(model, content, str(path))
+    return content
 
 
 def held(lock: Path) -> bool:

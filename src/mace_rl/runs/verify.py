@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mace_rl import files
 from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import difference
@@ -23,12 +24,16 @@ def repeat(then: FinishedRun) -> tuple[bool, str]:
     from mace_rl.runs.run import run  # PyTorch takes seconds to import
 
     config, before = then.config, then.episodes
+    for name in files.RESULTS:
+        if (then.folder / name).exists():  # a kept run may have its episodes only
+            then.content(name)
     with tempfile.TemporaryDirectory() as temporary:
         run(config, Path(temporary))
         now = FinishedRun(temporary)
         after = now.episodes
     name = f"{config.environment} {config.variant} seed {config.seed}"
-    if then.record["outputs"] == now.record["outputs"]:
+    outputs = [record["outputs"] for record in (then.record, now.record)]
+    if outputs[0] == outputs[1]:
         return True, f"{name}: equal to the bit"
     old, new = (
         {key: record[key] for key in ("versions", "sources")} | {"cpu": record["machine"]["cpu"]}
@@ -36,7 +41,8 @@ def repeat(then: FinishedRun) -> tuple[bool, str]:
     )
     different = (before != after).any(axis=1).to_numpy()
     first = f"from episode {different.argmax() + 1}"
-    where = first if different.any() else "in the agent's weights only"
+    others = [name for name in files.RESULTS if outputs[0].get(name) != outputs[1].get(name)]
+    where = first if different.any() else f"in {' and '.join(others)} only"
     means = [frame["extrinsic_return"].mean() for frame in (before, after)]
     return False, (
         f"{name}: different {where}; "

@@ -131,8 +131,8 @@ def film(
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
     with closing(filmed), nothing_printed(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # as `evaluate` does
-        filmed.unwrapped.reset(seed=seed)
+        torch.manual_seed(seed)
+        filmed.env.reset(seed=seed)  # as `evaluate` does; no picture of it
         for _ in range(episodes):
             roll_out(environment, policy, draw_noise(environment, generator))
     return filmed.film

@@ -54,11 +54,18 @@ class Table1Config(Section):
         numbers = self.values.get(environment, {}).get(variant)
         return numbers[self.metrics.index(metric)] if numbers and metric in self.metrics else None
 
+    def metric_of(self, reading: str) -> str | None:
+        """The metric that this is a reading of: of those that its name begins with the longest."""
+        kinds = [metric for metric in self.metrics if reading.startswith(metric)]
+        return max(kinds, key=len, default=None)
+
     def values_of(self, environments: Sequence[str], reading: str) -> dict[str, float]:
         """By variant what the paper has of this reading's metric; nothing of several together."""
-        kinds = [place for place, kind in enumerate(self.metrics) if reading.startswith(kind)]
+        kind = self.metric_of(reading)
         rows = self.values.get(environments[0], {}) if len(environments) == 1 else {}
-        return {name: rows[name][kinds[0]] for name in self.variants if kinds and rows}
+        if kind is None or not rows:
+            return {}
+        return {name: rows[name][self.metrics.index(kind)] for name in self.variants}
 
     def is_within(self, environments: Iterable[str], variants: Iterable[str]) -> bool:
         """Whether a study of these has all that the table has."""
@@ -234,7 +241,7 @@ def _check_form(claims: ClaimsConfig) -> None:
     read = [*zip(table1.public_code, table1.metrics, strict=False)]
     if table1.public_code and not (
         len(table1.public_code) == len(table1.metrics)
-        and all(reading.startswith(metric) for reading, metric in read)
+        and all(table1.metric_of(reading) == metric for reading, metric in read)
     ):
         raise ConfigError(
             f"table1.public_code is {table1.public_code}, but should be a reading of each of"

@@ -225,12 +225,15 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
         source_files(reference, f"in the settings of {environment} and {variant}, {key}")
+    given = {f"variant_settings.{variant}": study.variant_settings[variant].settings}
+    given["the changes"] = {key: value for key, value in changes.items() if value is not None}
     for section, reason in unused_sections(config).items():
-        if section in study.variant_settings[variant].settings:
-            raise ConfigError(
-                f"variant_settings.{variant} has the section {section!r}, which a variant with "
-                f"{reason} does not use"
-            )
+        for name, layer in given.items():
+            if section in layer:
+                raise ConfigError(
+                    f"{name} has the section {section!r}, which a variant with {reason} does not"
+                    " use"
+                )
     _check_environment(config)
     return config
 

@@ -27,7 +27,9 @@ def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metr
     """Every reading, in episodes, with the one of the paper's metrics that it reads."""
     both = itertools.product(table1.metrics, all_metrics(settings))
     return [
-        (kind, one) for kind, one in both if one.unit == "episodes" and one.name.startswith(kind)
+        (kind, one)
+        for kind, one in both
+        if one.unit == "episodes" and table1.metric_of(one.name) == kind
     ]
 
 

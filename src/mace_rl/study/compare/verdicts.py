@@ -114,6 +114,6 @@ def _in_paper(claim: ClaimConfig, table1: Table1Config, settings: MetricsConfig)
         return ""
     lower = metric_units(settings)[part.metric] == "episodes"
     best = (min if lower else max)(values, key=values.__getitem__)
-    metric = next(one for one in table1.metrics if part.metric.startswith(one))
+    metric = table1.metric_of(part.metric)
     numbers = ", ".join(f"{table1.variants[name]} {value}" for name, value in values.items())
     return f"{metric}: {numbers}; the best is {table1.variants[best]}"

@@ -39,7 +39,8 @@ class Quantity:
     window: int  # episodes of its moving average; 1: the values as they are
     name: str  # of the moving average in the data of single seeds
     label: str  # of the y axis
-    limits: tuple[float, float] | None = None  # of the y axis; None: what the single seeds span
+    # Of the y axis, and further up where seeds are; None: what the single seeds span.
+    limits: tuple[float, float] | None = None
     zero_is_shown: bool = True  # whether a variant has a curve that is 0 throughout
 
 
@@ -115,10 +116,15 @@ def mean_curves(
             raise RecordError(f"the seeds of {environment}, {variant} differ in their episodes")
         ends = interval(values, settings)
         if shown.limits is not None:  # where the mean lies, the ends of its interval do
-            ends = np.clip(ends, *shown.limits)
+            ends = np.clip(ends, *reaching(shown.limits, values))
         row = (environment, variant, wide.index, values.mean(axis=0), *ends, len(values))
         curves.append(pd.DataFrame(dict(zip(columns, row, strict=True))))
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
+
+
+def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
+    """`limits`, the upper one raised to the largest of `values`: β may be above 1."""
+    return limits[0], max(limits[1], values.max())
 
 
 def draw_figure(
@@ -138,7 +144,8 @@ def draw_figure(
             own, runs = (frame[frame["env"] == environment] for frame in (curves, single_seeds))
             values = runs[shown.name]
             margin = 0.05 * (values.max() - values.min() or 1)
-            axes.set_ylim(shown.limits or (values.min() - margin, values.max() + margin))
+            spanned = values.min() - margin, values.max() + margin
+            axes.set_ylim(reaching(shown.limits, values) if shown.limits else spanned)
             axes.set_xlim(0, own["episode"].max())
             axes.locator_params(nbins=4)
             axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))

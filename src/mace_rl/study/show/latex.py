@@ -1,5 +1,6 @@
 """The paper's Table 1 and Table 2 as LaTeX to \\input: captions, tabulars and cells."""
 
+import unicodedata
 from collections.abc import Mapping
 
 import pandas as pd
@@ -14,15 +15,30 @@ from mace_rl.study.show.tables import COLUMNS_PER_BLOCK, DASH, Cell
 
 INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
 
+_NAMED = (  # what LaTeX calls them; Greek letters without a name there look Latin
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau"
+    " upsilon phi chi psi omega Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega"
+)
+_LIKE_LATIN = {"Alpha": "A", "Beta": "B", "Epsilon": "E", "Zeta": "Z", "Eta": "H", "Iota": "I"}
+_LIKE_LATIN |= {"Kappa": "K", "Mu": "M", "Nu": "N", "Omicron": "O", "Rho": "P", "Tau": "T"}
+_LIKE_LATIN |= {"Chi": "X", "omicron": "o"}
+
+
+def _greek(name: str) -> str:
+    """The letter that LaTeX calls so."""
+    size = "CAPITAL" if name[0].isupper() else "SMALL"
+    return unicodedata.lookup(f"GREEK {size} LETTER {name.replace('mbda', 'mda').upper()}")
+
+
+_GREEK = {_greek(name): rf"$\{name}$" for name in _NAMED.split()}
+_GREEK |= {_greek(name): latin for name, latin in _LIKE_LATIN.items()}
 _LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     | {"<": "$<$", ">": "$>$", "|": "$|$", "±": r"$\pm$", "\u00d7": r"$\times$", "−": "$-$"}
     | {"\u2013": "--", "\u2014": "---", "₀": "$_0$", "≤": r"$\leq$", "≥": r"$\geq$"}
-    | {"\u03b1": r"$\alpha$", "β": r"$\beta$", "\u03b3": r"$\gamma$", "δ": r"$\delta$"}
-    | {"ε": r"$\epsilon$", "ϵ": r"$\epsilon$", "η": r"$\eta$", "θ": r"$\theta$"}
-    | {"λ": r"$\lambda$", "μ": r"$\mu$", "\u03c3": r"$\sigma$", "τ": r"$\tau$"}
-    | {"\U0001d43e": "$K$", "⁻": "$^-$"}
+    | _GREEK
+    | {"ϵ": r"$\epsilon$", "ς": r"$\varsigma$", "\U0001d43e": "$K$", "⁻": "$^-$"}
     | {power: f"$^{digit}$" for digit, power in enumerate("⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹")}
 )
 
@@ -83,7 +99,11 @@ def escaped(text: str) -> str:
 
 
 def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
-    """A table for \\input, as wide as the page; it needs the package booktabs and nothing else."""
+    """A table for \\input, as wide as the page.
+
+    It needs the package booktabs and, if a label has letters that LaTeX's own fonts have not,
+    such as Cyrillic ones, the package fontenc.
+    """
     head, *names = frame.columns
     starts = range(0, len(names), COLUMNS_PER_BLOCK)
     blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
