@@ -164,6 +164,20 @@ def test_a_mistaken_value_of_an_option_is_named_alone(monkeypatch, tmp_path, com
     assert call(monkeypatch, name, str(tmp_path), option, value) == (1, expected)
 
 
+def test_an_empty_path_is_refused(monkeypatch, capsys):
+    assert call(monkeypatch, "train", "--out", "", *sum(GOOD.items(), ()))[0] == 2
+    assert "argument --out: it is empty" in capsys.readouterr().err
+
+
+def test_running_out_of_memory_is_said(monkeypatch):
+    def greedy(_) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(cli, "train", greedy)
+    expected = (1, "mace-rl: out of memory")
+    assert call(monkeypatch, "train", *sum(GOOD.items(), ())) == expected
+
+
 def test_an_interrupted_training_says_that_it_resumes(monkeypatch, caplog):
     def interrupted(_) -> None:
         raise KeyboardInterrupt

@@ -99,6 +99,10 @@ MISTAKES = {
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
     "the changes has the section 'memory', which": {"variant": "ppo", "memory": {"capacty": 3}},
     "the section 'meta', which a variant with beta.kind": {"variant": "mace_fixed", "meta": {}},
+    "environment is None, but should be a name": {"environment": None},
+    "variant is 3, but should be a name": {"variant": 3},
+    "seed is '3', but should be an integer from 0": {"seed": "3"},
+    "seed is True, but should be an integer from 0": {"seed": True},
 }
 
 
@@ -106,6 +110,20 @@ MISTAKES = {
 def test_a_mistake_gets_one_line(message):
     with refused(ConfigError, re.escape(message)):
         settings(**{"environment": "CartPole-v1"} | MISTAKES[message])
+
+
+@pytest.mark.parametrize("name", ["my variant", "β", "a/b", "..", "x" * 201])
+def test_a_variant_s_name_is_that_of_a_folder(tmp_path, name):
+    own = {name: {"beta": {"kind": "constant", "value": 0.1}}}
+    (tmp_path / "own.yaml").write_text(json.dumps({"variant_settings": own}))
+    with refused(ConfigError, "variant has '.*, but a name here becomes a folder"):
+        settings("CartPole-v1", name, config=tmp_path / "own.yaml", episodes=2)
+
+
+def test_what_no_layer_has_is_missing_in_the_variant(tmp_path):
+    (tmp_path / "own.yaml").write_text("variant_settings: {own: {label: x}}")
+    with refused(ConfigError, "in variant_settings.own, the key 'beta' is missing"):
+        settings("CartPole-v1", "own", config=tmp_path / "own.yaml", episodes=2)
 
 
 class Text(str):

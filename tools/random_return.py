@@ -70,7 +70,7 @@ def main() -> None:
     )
     parser.add_argument("environment", help="its Gymnasium id")
     parser.add_argument("episodes", type=int)
-    parser.add_argument("configs", nargs="*", help="files over config.yaml")
+    parser.add_argument("configs", nargs="*", default=[], help="files over config.yaml")
     arguments = parser.parse_args()
     name, episodes = arguments.environment, arguments.episodes
     if episodes < 2:

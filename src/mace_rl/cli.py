@@ -20,6 +20,13 @@ from mace_rl.study.config import folder_of
 logger = logging.getLogger(__name__)
 
 
+def path(text: str) -> Path:
+    """A path; of a shell's variable that is not set it would be the folder one is in."""
+    if not text:
+        raise argparse.ArgumentTypeError("it is empty")
+    return Path(text)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line of `mace-rl`."""
     plain: dict[str, Any] = {"allow_abbrev": False}
@@ -34,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=does, description=does, epilog=epilog, **plain)
         added.set_defaults(run=run)
         if folder:
-            added.add_argument("folder", type=Path, help=folder)
+            added.add_argument("folder", type=path, help=folder)
         return added.add_argument
 
     flag = {"action": "store_true"}
@@ -50,10 +57,10 @@ def parser() -> argparse.ArgumentParser:
     add("--max-episode-steps", type=int, help="instead of the environment's own time limit")
     several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
     over = "YAML files read over the default settings, one after the other"
-    add("--config", type=Path, **several, help=over)
+    add("--config", type=path, **several, help=over)
     slower = "of policy and critics: compiled (default) or plain PyTorch, slower, to check it by"
     add("--engine", choices=["compiled", "torch"], help=slower)
-    add("--out", type=Path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
+    add("--out", type=path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
     anew = "move a run that is in the folder into a folder below it, and train from the start"
     add("--restart", **flag, help=anew)
     does = "print how far the workflow's runs are, and about when they will be done"
@@ -74,15 +81,15 @@ def parser() -> argparse.ArgumentParser:
     add("--seconds", type=float, default=10.0, help="of each episode at most (default: 10)")
     add("--width", type=int, default=300, help="in pixels (default: 300)")
     out = "a GIF file (default: watch.gif or watch_untrained.gif in the folder)"
-    add("--out", type=Path, help=out)
+    add("--out", type=path, help=out)
     does = "write what runs recorded, finished or not, as event files for TensorBoard"
     add = command("tensorboard", tensorboard, does, "cartpole_run --out events", below)
-    add("--out", type=Path, help="folder for the event files (default: beside the records)")
+    add("--out", type=path, help="folder for the event files (default: beside the records)")
     does = (
         "write the episodes of finished runs as one table: task, algorithm, seed, step, return ..."
     )
     add = command("export", export, does, "cartpole_run --out runs.csv", below)
-    add("--out", type=Path, required=True, help="a file that ends in .csv or .parquet")
+    add("--out", type=path, required=True, help="a file that ends in .csv or .parquet")
     does = "repeat kept runs and compare to the bit"
     add = command("verify", verify, does, "reference --sample 1", below)
     add("--sample", type=int, help="how many, always the same ones (default: all)")
@@ -123,7 +130,8 @@ def train(arguments: argparse.Namespace) -> None:
     default = Path("runs", folder_of(config.environment), config.variant, f"seed{config.seed}")
     out: Path = arguments.out or default
     if not arguments.restart and finished(config, out):
-        (out / files.CHECKPOINT).unlink(missing_ok=True)  # killed between the two
+        if (out / files.CHECKPOINT).exists():  # killed between the two
+            (out / files.CHECKPOINT).unlink()
         logger.info("%s holds this run already, finished", out)
         return
     from mace_rl.runs import progress, run  # PyTorch takes seconds, a mistake should not
@@ -206,7 +214,7 @@ def main() -> None:
     try:
         arguments.run(arguments)
     except (Refusal, OSError, MemoryError) as error:
-        sys.exit(f"mace-rl: {' '.join(str(error).split())}")
+        sys.exit(f"mace-rl: {' '.join(str(error).split()) or 'out of memory'}")
     except ModuleNotFoundError as error:
         if arguments.command == "train":  # in the user's own code, whose place the traceback tells
             raise

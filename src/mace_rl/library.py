@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.records import EpisodeRecord
 from mace_rl.runs.finished import FinishedRun, finished
 from mace_rl.study.config import read_study
@@ -46,6 +46,9 @@ def settings(
 
     Raises `ConfigError`, one line, for wrong settings.
     """
+    for name, value in {"environment": environment, "variant": variant}.items():
+        if not isinstance(value, str):
+            raise ConfigError(f"{name} is {short_repr(value)}, but should be a name")
     over = [config] if isinstance(config, str | Path) else config
     study = read_study([DEFAULTS, *map(Path, over)], every_run=False)
     try:

@@ -139,8 +139,8 @@ class Study(Section):
             found = _resolve(self, environment, variant, changes or {})
             if not changes:
                 self._resolved[environment, variant] = found
-        if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
-            raise ConfigError(f"seed is {seed!r}, but should be from 0 to 4294967295")
+        if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+            raise ConfigError(f"seed is {seed!r}, but should be an integer from 0 to 4294967295")
         return found.model_copy(update={"seed": int(seed)})
 
 
@@ -217,11 +217,14 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
     settings = reduce(merge_layers, layers.values())
     settings |= {"environment": environment, "variant": variant, "seed": 0}
     _check_name(environment, "environment")
+    _check_name(variant, "variant")
     try:
         config = RunConfig.model_validate(settings)
     except ValidationError as error:
         location = error.errors(include_url=False)[0]["loc"]
-        name = max(reversed(layers), key=lambda name: _depth(layers[name], location))
+        depths = {name: _depth(layers[name], location) for name in reversed(layers)}
+        name = max(depths, key=depths.__getitem__)
+        name = name if depths[name] else f"variant_settings.{variant}"  # what no layer has
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
         source_files(reference, f"in the settings of {environment} and {variant}, {key}")
