@@ -42,7 +42,8 @@ def settings(
     variant: what sets β: "ppo" (no bonus), "mace_fixed", "mace_full", or one of `config`.
     config: YAML files like config.yaml. They may have further variants.
     changes: any field of `RunConfig`, such as episodes=200, max_episode_steps=100 or
-        beta={"kind": "constant", "value": 0.2}. Sections merge, as in ppo={"clip": 0.1}.
+        beta={"kind": "constant", "value": 0.2}. Sections merge, as in ppo={"clip": 0.1}. One that
+        the variant does not use is checked and left out: the same changes fit all variants.
 
     Raises `ConfigError`, one line, for wrong settings.
     """

@@ -17,6 +17,8 @@ from typing import Annotated, Any
 import gymnasium
 from pydantic import AfterValidator, Field, ValidationError
 
+from mace_rl.config.beta import MetaConfig
+from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.plugins import import_module, load, source_files
 from mace_rl.config.reading import Settings, merge, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
@@ -29,6 +31,15 @@ from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 # What the figures' font has; Matplotlib leaves out of legends what begins with '_'.
 LABEL = r"(?![_ ])[ -\u02af\u0370-\u037e\u0384-\u0525\u2010-\u20b5\u2190-\u22ff]{1,60}(?<! )"
+
+
+class LeftOut(Section):
+    """The sections that some variants do not use: one that is given is checked all the same."""
+
+    bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+    memory: MemoryConfig | None = None
+    novelty: NoveltyConfig | None = None
+    meta: MetaConfig | None = None
 
 
 def _label(text: str) -> str:
@@ -228,15 +239,15 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
         source_files(reference, f"in the settings of {environment} and {variant}, {key}")
-    given = {f"variant_settings.{variant}": study.variant_settings[variant].settings}
-    given["the changes"] = {key: value for key, value in changes.items() if value is not None}
-    for section, reason in unused_sections(config).items():
-        for name, layer in given.items():
-            if section in layer:
-                raise ConfigError(
-                    f"{name} has the section {section!r}, which a variant with {reason} does not"
-                    " use"
-                )
+    unused = unused_sections(config)
+    for section, reason in unused.items():
+        if section in study.variant_settings[variant].settings:
+            raise ConfigError(
+                f"variant_settings.{variant} has the section {section!r}, which a variant with "
+                f"{reason} does not use"
+            )
+    left_out = {name: settings[name] for name in unused if changes.get(name) is not None}
+    check(LeftOut, left_out, "in the changes")
     _check_environment(config)
     return config
 
