@@ -169,13 +169,13 @@ def test_an_empty_path_is_refused(monkeypatch, capsys):
     assert "argument --out: it is empty" in capsys.readouterr().err
 
 
-def test_running_out_of_memory_is_said(monkeypatch):
-    def greedy(_) -> None:
-        raise MemoryError
+@pytest.mark.parametrize("error, said", [(MemoryError, "out of memory"), (OSError, "OSError()")])
+def test_an_error_without_words_is_said(monkeypatch, error, said):
+    def failing(_) -> None:
+        raise error
 
-    monkeypatch.setattr(cli, "train", greedy)
-    expected = (1, "mace-rl: out of memory")
-    assert call(monkeypatch, "train", *sum(GOOD.items(), ())) == expected
+    monkeypatch.setattr(cli, "train", failing)
+    assert call(monkeypatch, "train", *sum(GOOD.items(), ())) == (1, f"mace-rl: {said}")
 
 
 def test_an_interrupted_training_says_that_it_resumes(monkeypatch, caplog):

@@ -214,7 +214,8 @@ def main() -> None:
     try:
         arguments.run(arguments)
     except (Refusal, OSError, MemoryError) as error:
-        sys.exit(f"mace-rl: {' '.join(str(error).split()) or 'out of memory'}")
+        bare = "out of memory" if isinstance(error, MemoryError) else repr(error)
+        sys.exit(f"mace-rl: {' '.join(str(error).split()) or bare}")
     except ModuleNotFoundError as error:
         if arguments.command == "train":  # in the user's own code, whose place the traceback tells
             raise
