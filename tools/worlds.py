@@ -27,7 +27,7 @@ from mace_rl.study.show.tables import side_by_side
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
 CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
-DECIDES = "robust"  # the way to measure that is pictured
+DECIDES = "robust"  # the way to measure that is counted and pictured
 COMMAND = "`python -m tools.worlds`"
 RULE = "[second rule](../../../docs/metrics.md#the-second-rule)"
 
@@ -82,13 +82,16 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     """The tables in words, for README.md."""
     said = "{verdict}; {shown} of {parts} shown; room {least_room:.3g} to {most_room:.3g}"
     sections = []
-    for way, own in tables["verdicts"].groupby("measured") if "verdicts" in tables else ():
+    ways = tables["verdicts"].groupby("measured") if "verdicts" in tables else ()
+    for way, own in sorted(ways, key=lambda pair: pair[0] != DECIDES):
         rows: Any = own.to_dict("records")
         long = own.assign(said=[said.format(**row) for row in rows])
         wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
         order = long[["claim", "statement"]].drop_duplicates()
         frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")
-        sections.append(Section(f"Verdicts: {way}", "Room: of its parts, in margins.", frame))
+        decides = "These decide" if way == DECIDES else "These do not decide"
+        note = f"{decides}. Room: of its parts, in margins."
+        sections.append(Section(f"Verdicts: {way}", note, frame))
     table = tables["numbers"]
     cells = table.assign(
         number=table["env"]
