@@ -286,6 +286,8 @@ def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
 
 # The file of what a paper says.
 
+SEVENTH = " " * 12 + "- {<<: *full, environments: [Acrobot-v1, HopperBulletEnv-v0], "
+SEVENTH += "metric: final_return}\n"
 MISTAKES = [  # one text for another, and what is said of it
     ("variant: mace_full", "variant: mace_ful", ["C1.parts", "'mace_ful'", "'mace_full'"]),
     ("metric: final_return", "metric: final_retrun", ["C6.parts", "'final_retrun'", "'final_re"]),
@@ -307,6 +309,9 @@ MISTAKES = [  # one text for another, and what is said of it
     ("rule: 2", "rule: 3", ["rule is 3", "1 or 2"]),
     (", no_room: no room", "", ["claims.words.no_room is None", "rule is 2"]),
     ("rule: 2", "rule: 1", ["words.no_room is 'no room'", "rule is 1"]),
+    ("[Acrobot-v1, HopperB", "[Acrobot-v1, Acrobot-v1, HopperB", ["'Acrobot-v1' should be there"]),
+    ("over: [ppo, mace_fixed]", "over: [ppo, ppo]", ["C1.parts", "'ppo' should be there once"]),
+    (SEVENTH, f"{SEVENTH}{SEVENTH}", ["C7.parts.by the paper's words and code has a part twice"]),
 ]
 
 

@@ -82,6 +82,10 @@ def test_what_is_damaged_is_named(tmp_path: Path) -> None:
         folder.add(path[0], **{said: '{"episode": 4}'})
         with pytest.raises(ConfigError, match=rf"{path}\.json: the key 'seconds' is missing"):
             folder.lines()
+    folder.plan["runs"] = []
+    folder.add("C", record=json.dumps(DONE | {"seconds": "100"}))
+    with pytest.raises(ConfigError, match=r"run\.json: seconds is '100', but"):
+        folder.lines()
     for text in ('{"cores": 2, "runs": [', "\udcff"):
         (tmp_path / "logs" / "plan.json").write_bytes(text.encode(errors="surrogateescape"))
         with pytest.raises(ConfigError, match=r"logs/plan\.json: cut off or altered"):

@@ -231,7 +231,7 @@ def test_verify_says_what_differs(trained, tmp_path, monkeypatch, capsys, sectio
     run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "runs")
     path = run / "run.json"
     record = json.loads(path.read_text(encoding="utf-8"))
-    record["machine"]["cpu"] = "Z80"
+    record["machine"] = {}
     record["config"]["seed"] = int(section != "outputs")
     record[section].update(change)
     (run / files.AGENT).unlink()  # as in a kept run

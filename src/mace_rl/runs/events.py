@@ -68,6 +68,10 @@ def read(run: Path) -> dict[str, pd.DataFrame]:
             prefix: pd.DataFrame({name: column.numpy() for name, column in state[key].items()})
             for prefix, key in (("episodes", "records"), ("updates", "diagnostics"))
         }
+        for table in tables.values():
+            kinds = {*table.dtypes.map(str)}
+            if not kinds <= {"int64", "float64"} or table["episode"].dtype != "int64":
+                raise ValueError("no training writes such columns")
         return {prefix: table.set_index("episode") for prefix, table in tables.items()}
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError):
         path = run / files.CHECKPOINT

@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, TextIO
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from mace_rl import files
 from mace_rl.config.section import ConfigError, check
@@ -26,6 +26,8 @@ EARLY = 0.1  # the share of its episodes before which a run's own estimate would
 
 class Planned(BaseModel):
     """A run of the workflow's plan."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
     env: str
     variant: str
@@ -43,6 +45,8 @@ class Plan(BaseModel):
 
 class Record(BaseModel):
     """What is needed of a run.json."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
     seconds: float
     start_seconds: float

@@ -36,8 +36,8 @@ def repeat(then: FinishedRun) -> tuple[bool, str]:
     if outputs[0] == outputs[1]:
         return True, f"{name}: equal to the bit"
     old, new = (
-        {key: record[key] for key in ("versions", "sources")} | {"cpu": record["machine"]["cpu"]}
-        for record in (then.record, now.record)
+        {key: one[key] for key in ("versions", "sources")} | {"cpu": one["machine"].get("cpu")}
+        for one in (then.record, now.record)
     )
     different = (before != after).any(axis=1).to_numpy()
     first = f"from episode {different.argmax() + 1}"

@@ -5,19 +5,17 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
 from mace_rl.study.measure.betas import CORRELATIONS
 from mace_rl.study.measure.metrics import METRICS, all_metrics
-from mace_rl.study.metrics_config import MetricsConfig
+from mace_rl.study.metrics_config import MetricsConfig, Names, once
 
 if TYPE_CHECKING:  # imports Gymnasium, which tables do without
     from mace_rl.study.config import Study
-
-Names = Annotated[list[str], Field(min_length=1)]
 
 
 class Part(NamedTuple):
@@ -86,7 +84,7 @@ class PartsConfig(Section):
     together: bool = False  # ... or, if true, one over all of them
     metric: str
     variant: str
-    over: list[str]  # a part for each; empty: over 0
+    over: Annotated[list[str], AfterValidator(once)]  # a part for each; empty: over 0
 
     @model_validator(mode="after")
     def _over_others(self) -> "PartsConfig":
@@ -271,3 +269,7 @@ def _check_form(claims: ClaimsConfig) -> None:
                     f"{key}.parts has {list(claim.parts)}, but should have {family.ways} as the"
                     " first of its family"
                 )
+            for way, parts in claim.parts.items():
+                each = [part[:-1] for one in parts for part in one.each(table1)]
+                if len(set(each)) < len(each):
+                    raise ConfigError(f"{key}.parts.{way} has a part twice")

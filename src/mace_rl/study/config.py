@@ -24,7 +24,7 @@ from mace_rl.config.reading import Settings, merge, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, check_known, explain, short_repr
 from mace_rl.environments import registered
-from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig
+from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig, Names, once
 
 # Environments and variants name folders and appear in Snakemake's patterns. An environment may have
 # more, as in Gymnasium: package.module:Namespace/Id.
@@ -63,13 +63,6 @@ def _folder(path: str) -> str:
     return path
 
 
-def _once(values: list[Any]) -> list[Any]:
-    repeated = [value for value, count in Counter(values).items() if count > 1]
-    if repeated:
-        raise ValueError(f"{repeated[0]!r} should be there once")
-    return values
-
-
 class Variant(Section):
     """One variant: how it is shown; its settings go over `training` and the environment's."""
 
@@ -85,7 +78,7 @@ class Variant(Section):
 
 
 Seeds = Annotated[
-    list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_once)
+    list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(once)
 ]
 
 
@@ -93,8 +86,8 @@ class Study(Section):
     """All runs of a study, each environment × variant × seed, and how they are evaluated."""
 
     results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
-    environments: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
-    variants: Annotated[list[str], Field(min_length=1), AfterValidator(_once)]
+    environments: Names
+    variants: Names
     seeds: Seeds
     # Other seeds for some environments, where one run takes long.
     environment_seeds: dict[str, Seeds] = Field(default={})

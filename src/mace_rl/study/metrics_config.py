@@ -1,9 +1,10 @@
 """How runs are measured, and how Figure 1 is laid out."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
 
 from mace_rl.config.section import ConfigError, Reference, Section
 
@@ -11,11 +12,22 @@ from mace_rl.config.section import ConfigError, Reference, Section
 GOALS = ("reference_return", "solved_return")
 
 
+def once(values: list[Any]) -> list[Any]:
+    """The same; `ValueError` if one is there twice, which would count twice."""
+    repeated = [value for value, count in Counter(values).items() if count > 1]
+    if repeated:
+        raise ValueError(f"{repeated[0]!r} should be there once")
+    return values
+
+
+Names = Annotated[list[str], Field(min_length=1), AfterValidator(once)]
+
+
 class ConstantsConfig(Section):
     """Which variants are drawn as return over constant β."""
 
     learned: str  # the line across
-    fixed: list[str] = Field(min_length=1)  # those whose β stays as it is, in their order
+    fixed: Names  # those whose β stays as it is, in their order
 
 
 class MetricsConfig(Section):
