@@ -27,8 +27,6 @@ EARLY = 0.1  # the share of its episodes before which a run's own estimate would
 class Planned(BaseModel):
     """A run of the workflow's plan."""
 
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
-
     env: str
     variant: str
     seed: int
