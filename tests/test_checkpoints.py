@@ -35,6 +35,8 @@ def signed(content: bytes) -> bytes:
         (lambda content: content[:-1] + bytes([content[-1] ^ 1]), "cut off or altered"),
         (lambda _: b"", "cut off or altered"),
         (lambda _: signed(checkpoint.archive({"identity": Bomb()})), "not a readable archive"),
+        (lambda _: signed(checkpoint.archive({})), "it has no identity or no state"),
+        (lambda _: signed(checkpoint.archive({"identity": 5, "state": {}})), "it has no identity"),
     ],
 )
 def test_damaged_checkpoint_is_not_continued(

@@ -223,6 +223,17 @@ def test_nobody_has_to_watch_a_training(tmp_path, shown):
     assert (process.returncode, files(tmp_path / "run")) == (0, sorted(RESULTS))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("shown", [">&-", ">/dev/full"])
+def test_an_output_that_is_lost_has_not_succeeded(trained, shown):
+    run = shlex.quote(str(trained("CartPole-v1", "ppo", episodes=3)))
+    command = f"{shlex.quote(sys.executable)} -m mace_rl evaluate {run} --episodes 1 {shown}"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(["sh", "-c", command], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("mace-rl: standard output: ")
+
+
 @pytest.mark.parametrize("command", [["status", "."], ["train", *sum(GOOD.items(), ())]])
 def test_what_leaves_by_itself_has_not_succeeded(monkeypatch, command):
     """A module of the user's that calls `sys.exit(0)` when it is imported."""

@@ -100,6 +100,9 @@ MISTAKES = {
     "in the changes: unknown key 'memory.capacty'": {"variant": "ppo", "memory": {"capacty": 3}},
     "in the changes: meta.horizon is 0, but": {"variant": "mace_fixed", "meta": {"horizon": 0}},
     "in the changes: novelty is 5, but": {"variant": "ppo", "novelty": 5},
+    "'max_episode_steps' is not for the environment's constructor": {
+        "environment_arguments": {"max_episode_steps": 5}
+    },
     "environment is None, but should be a name": {"environment": None},
     "variant is 3, but should be a name": {"variant": 3},
     "seed is '3', but should be an integer from 0": {"seed": "3"},

@@ -37,6 +37,7 @@ from shared import (
 from mace_rl import sources
 from mace_rl.environments import hopper
 from mace_rl.files import LOCK
+from mace_rl.records import RecordError
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
 from mace_rl.trainer import Trainer
@@ -50,6 +51,9 @@ def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
     frames = read_runs([str(directory / "run.json")], [("CartPole-v1", "mace_full", 0, 5)])
     frame = frames["CartPole-v1", "mace_full", 0]
     assert frame.to_dict("records") == [vars(record) for record in trainer.records]
+    for other in (("CartPole-v1", "ppo", 0), ("CartPole-v1", "mace_full", 1)):
+        with pytest.raises(RecordError, match=r"run\.json: it is of CartPole-v1 mace_full 0, not"):
+            read_runs([str(directory / "run.json")], [(*other, 5)])
     frame = pd.read_csv(directory / "diagnostics.csv")
     expected = [vars(record) for record in trainer.diagnostics]
     np.testing.assert_equal(frame.to_dict("records"), expected)

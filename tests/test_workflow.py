@@ -192,6 +192,8 @@ def test_a_damaged_result_is_named_on_the_terminal(finished: Project) -> None:
         ("--configfiles config.yaml latin1.yaml", "latin1.yaml: cannot be read: it is not UTF-8"),
         ("--config claims=latin1.yaml", "config.yaml: latin1.yaml: cannot be read: it is"),
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
+        ("--configfile config.yaml --configfiles config.yaml", "--configfile is there 2 times"),
+        ("--config seeds=[0] -C variants=[ppo]", "--config is there 2 times"),
     ],
 )
 def test_mistakes_end_in_one_line(finished: Project, options: str, expected: str) -> None:

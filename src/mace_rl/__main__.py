@@ -1,6 +1,16 @@
-"""`python -m mace_rl`: the command `mace-rl`."""
+"""The command `mace-rl`, also as `python -m mace_rl`."""
 
-from mace_rl.cli import main
+import sys
+
+
+def main() -> None:
+    """Entry point; exits with 130, quietly, if it is interrupted while modules are imported."""
+    try:
+        from mace_rl.cli import main as command
+    except KeyboardInterrupt:
+        sys.exit(130)
+    command()
+
 
 if __name__ == "__main__":
     main()

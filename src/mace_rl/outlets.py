@@ -21,11 +21,14 @@ class Outlet(io.FileIO):
 
 
 def keep_open(descriptor: int) -> None:
-    """Open /dev/null in place of a closed descriptor: the next file would get its number."""
+    """Open /dev/null in place of a closed descriptor: the next file would get its number.
+
+    For reading alone, so that writing fails, as it does where it is closed.
+    """
     try:
         os.fstat(descriptor)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), descriptor)
         os.set_inheritable(descriptor, True)  # dup2 does not if it got this number itself
 
 

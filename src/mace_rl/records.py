@@ -94,7 +94,7 @@ class RecordError(Refusal, ValueError):
 
 def write_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write `as_columns` of `EpisodeRecord`s, atomically; `RecordError` if they are impossible."""
-    _check_episodes(path, columns)
+    check_episodes(path, columns)
     _write(path, columns)
 
 
@@ -118,7 +118,7 @@ def read_episodes(path: str | Path, episodes: int, digest: str | None = None) ->
     """
     columns = get_type_hints(EpisodeRecord)
     frame = read_table(path, columns, digest)
-    _check_episodes(path, {name: frame[name].to_numpy() for name in columns})
+    check_episodes(path, {name: frame[name].to_numpy() for name in columns})
     if len(frame) != episodes:
         raise RecordError(
             f"{path}: line {len(frame) + 1} is the last, after {len(frame)} episodes;"
@@ -197,7 +197,7 @@ def _parse(cell: str, kind: type, name: str) -> int | float | str:
     return value
 
 
-def _check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+def check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """Refuse rows that no training could have produced; `columns` hold arrays [episodes]."""
     (number, steps, length, returns, bonus, beta, ended) = columns.values()
     rules = {  # whether each row is right, [episodes], and what would be right

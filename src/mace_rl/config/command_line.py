@@ -13,10 +13,16 @@ def checked() -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--cores", "-c", nargs="?", const="all")
     parser.add_argument("--jobs", "-j", nargs="?", const="all")
-    parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", default=[])
-    parser.add_argument("--config", "-C", nargs="*", default=[])  # not short for --configfile
+    parser.add_argument("--configfile", "--configfiles", nargs="+", action="append", default=[])
+    # Beside the other one it is not short for --configfile.
+    parser.add_argument("--config", "-C", nargs="*", action="append", default=[])
     given, _ = parser.parse_known_args()
     try:
+        for option in ("configfile", "config"):
+            once = getattr(given, option)
+            if len(once) > 1:  # Snakemake reads the last alone
+                raise ConfigError(f"--{option} is there {len(once)} times: give one all its values")
+            setattr(given, option, [value for values in once for value in values])
         for file in [*Path().glob("config.yaml"), *given.configfile]:
             read_yaml(Path(file))
         read_options(given.config)

@@ -7,9 +7,9 @@ it, says what each means and may be. Equal `RunConfig`s and equal code give equa
 import json
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, PositiveInt, model_validator
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.beta import BetaConfig, MetaConfig
@@ -22,6 +22,18 @@ IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 
 
+def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
+    if of_gymnasium := {"id", "max_episode_steps", "disable_env_checker"} & set(arguments):
+        raise ValueError(
+            f"{min(of_gymnasium)!r} is not for the environment's constructor; the time limit is"
+            " the setting max_episode_steps beside environment_arguments"
+        )
+    return arguments
+
+
+EnvironmentArguments = Annotated[Arguments, AfterValidator(_of_the_constructor)]
+
+
 class AgentConfig(Section):
     """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
@@ -32,7 +44,7 @@ class AgentConfig(Section):
     seed: int = Field(ge=0, lt=2**32)
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
-    environment_arguments: Arguments = Field(default={})  # for the environment's constructor
+    environment_arguments: EnvironmentArguments = Field(default={})  # for its constructor
     trainer: Literal["published"] | None = None  # `mace_rl.published`; None: `mace_rl.trainer`
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig

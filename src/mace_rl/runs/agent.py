@@ -130,6 +130,6 @@ class Player:
 
 def _kind(entry: Any) -> str:
     """The type and shape of an entry of a state, for messages."""
-    if isinstance(entry, Tensor):
+    if isinstance(entry, Tensor) and not entry.is_nested:  # which has no shape
         return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
     return "missing" if entry is None else f"a {type(entry).__name__}"

@@ -82,4 +82,7 @@ def read(path: Path) -> dict[str, Any]:
     digest, _, data = path.read_bytes().partition(b"\n")
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
-    return unarchive(data, path)
+    content = unarchive(data, path)
+    if not all(isinstance(content.get(key), dict) for key in ("identity", "state")):
+        raise CheckpointError(f"{path}: it has no identity or no state")
+    return content

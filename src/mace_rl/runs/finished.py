@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl import files
 from mace_rl.config.plugins import code_outside
-from mace_rl.config.run import AgentConfig, RunConfig
+from mace_rl.config.run import IDENTITY, AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
-from mace_rl.records import ALTERED, EpisodeRecord, RecordError, RunKey, read_episodes
+from mace_rl.records import (
+    ALTERED,
+    EpisodeRecord,
+    RecordError,
+    RunKey,
+    as_columns,
+    check_episodes,
+    read_episodes,
+)
 from mace_rl.runs.provenance import difference, identity, read_record
 
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
@@ -98,10 +106,13 @@ class FinishedRun:
         try:
             lines = csv.DictReader(io.StringIO(content.decode(), newline=""))
             rows = [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
-        except (KeyError, TypeError, ValueError, csv.Error):
+            columns = as_columns(EpisodeRecord, rows)
+        except (KeyError, TypeError, ValueError, OverflowError, csv.Error):
             rows = []
+        path = self.folder / files.EPISODES
         if len(rows) != self.record["config"]["episodes"]:
-            raise RecordError(f"{self.folder / files.EPISODES}: {NEVER_WRITTEN}")
+            raise RecordError(f"{path}: {NEVER_WRITTEN}")
+        check_episodes(path, columns)
         return rows
 
     @cached_property
@@ -130,12 +141,17 @@ def read_runs(
     """The episodes of each run; raises what `FinishedRun.frame` raises.
 
     records: the paths of their `run.json`; runs: their environment, variant, seed and number of
-    episodes.
+    episodes. `RecordError` if a record is of another run than its place is for.
     """
-    return {
-        (environment, variant, seed): FinishedRun(Path(record).parent).frame(episodes)
-        for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True)
-    }
+    found: dict[RunKey, pd.DataFrame] = {}
+    for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
+        run, wanted = FinishedRun(Path(record).parent), (environment, variant, seed)
+        own = tuple(run.record["config"][key] for key in IDENTITY)
+        if own != wanted:
+            names = (" ".join(map(str, key)) for key in (own, wanted))
+            raise RecordError("{}: it is of {}, not of {}".format(record, *names))
+        found[wanted] = run.frame(episodes)
+    return found
 
 
 def finished(config: RunConfig, directory: Path) -> bool:

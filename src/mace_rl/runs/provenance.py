@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from mace_rl import sources
 from mace_rl.config.plugins import source_files
@@ -29,6 +29,8 @@ PACKAGES = (
 class RecordedConfig(BaseModel):
     """The keys of every configuration in a run.json, also of other versions."""
 
+    model_config = ConfigDict(strict=True)
+
     environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # cells of the table of `export`
     variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
     seed: int
@@ -37,6 +39,8 @@ class RecordedConfig(BaseModel):
 
 class RunRecord(BaseModel):
     """The keys of every run.json."""
+
+    model_config = ConfigDict(strict=True)
 
     config: RecordedConfig
     versions: dict[str, str]

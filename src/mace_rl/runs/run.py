@@ -67,7 +67,8 @@ def run(
     directory.mkdir(parents=True, exist_ok=True)
     with exclusive(directory) as lock, threadpool_limits(1), single_threaded():
         if aside == "nothing" and finished(config, directory):
-            (directory / files.CHECKPOINT).unlink(missing_ok=True)  # of a run killed at its end
+            if (directory / files.CHECKPOINT).exists():  # of a run killed at its end
+                (directory / files.CHECKPOINT).unlink()
             return
         started = time.monotonic()
         identity = provenance.identity(config)
