@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
-from mace_rl import files
+from mace_rl import files, sources
 from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import IDENTITY, AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
@@ -68,7 +68,13 @@ class FinishedRun:
 
     def _checked(self, model: type[Config]) -> Config:
         origin, values = str(self.folder / files.RECORD), self.record["config"]
-        config = check(model, values, origin)
+        try:
+            config = check(model, values, origin)
+        except ConfigError as error:
+            if self.record["sources"] == sources.digest("training"):
+                raise
+            reason = f"{error}; this run was trained by other code, which may have had other keys"
+            raise ConfigError(reason) from None
         for key, text in ({} if self.trust else code_outside(values)).items():
             raise ConfigError(
                 f"{origin}: {key} has {short_repr(text)}, code from outside mace_rl: "
