@@ -9,6 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from types import ModuleType
 
 import pytest
 import yaml
@@ -16,7 +17,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from shared import GOOD, RESULTS, Bonanza, call, files, refusal
 
-from mace_rl import cli
+from mace_rl import __main__, cli
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.runs import run
@@ -176,6 +177,17 @@ def test_an_error_without_words_is_said(monkeypatch, error, said):
 
     monkeypatch.setattr(cli, "train", failing)
     assert call(monkeypatch, "train", *sum(GOOD.items(), ())) == (1, f"mace-rl: {said}")
+
+
+def test_an_interrupt_during_imports_is_quiet(monkeypatch):
+    class Module(ModuleType):
+        def __getattr__(self, name: str):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "mace_rl.cli", Module("mace_rl.cli"))
+    with pytest.raises(SystemExit) as caught:
+        __main__.main()
+    assert caught.value.code == 130
 
 
 def test_an_interrupted_training_says_that_it_resumes(monkeypatch, caplog):

@@ -103,6 +103,7 @@ MISTAKES = {
     "'max_episode_steps' is not for the environment's constructor": {
         "environment_arguments": {"max_episode_steps": 5}
     },
+    "'id' is not for the environment's constructor": {"environment_arguments": {"id": "A-v0"}},
     "environment is None, but should be a name": {"environment": None},
     "variant is 3, but should be a name": {"variant": 3},
     "seed is '3', but should be an integer from 0": {"seed": "3"},

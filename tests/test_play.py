@@ -22,7 +22,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.runs import watch
 from mace_rl.runs.agent import Agent, load_agent
 from mace_rl.runs.evaluate import evaluate
-from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.finished import FinishedRun, finished
 from mace_rl.runs.observations import ObservationError, encoded
 from mace_rl.trainer import Trainer
 
@@ -104,8 +104,10 @@ def test_an_agent_plays_whatever_version_of_the_method_trained_it(trained, tmp_p
     with pytest.raises(ConfigError, match=r"run\.json: the key 'meta\.pretrained' is missing$"):
         _ = FinishedRun(tmp_path).config
     (tmp_path / "run.json").write_text(json.dumps(record | {"sources": "0" * 64}))
-    with pytest.raises(ConfigError, match=r"'meta\.pretrained' is missing; [^\n]* by other code"):
+    with pytest.raises(ConfigError, match=r"'meta\.pretrained' is missing; [^\n]* of other code"):
         _ = FinishedRun(tmp_path).config
+    with pytest.raises(ConfigError, match=r"is missing; [^\n]* --restart"):
+        finished(FinishedRun(folder).config, tmp_path)
     record["config"]["ppo"]["clpi"] = 0.2
     (tmp_path / "run.json").write_text(json.dumps(record))
     with pytest.raises(ConfigError, match=r"unknown key .ppo\.clpi"):

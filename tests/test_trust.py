@@ -126,12 +126,14 @@ DAMAGE = {
     f"{BIAS} is a Tensor": lambda s: archive(s | {BIAS: torch.nested.nested_tensor([s[BIAS]])}),
     f"{BIAS} is missing": lambda s: archive({k: v for k, v in s.items() if k != BIAS}),
     "other is .* should be missing": lambda s: archive(s | {"other": torch.ones(1)}),
+    "other is a NoneType, but should be missing": lambda s: archive(s | {"other": None}),
     "not a readable archive: it is compressed": lambda _: compressed(),
     "not a readable archive": lambda _: archive(torch.ones(3)),
     "not a readable archive: File": lambda _: b"no archive",
 }
 
 
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
 @pytest.mark.parametrize("message", DAMAGE)
 def test_an_agent_that_does_not_fit_is_refused_by_the_entry(kept, message):
     run = kept()
@@ -163,7 +165,10 @@ RECORDS = [  # a text of run.json, another in its place, and what is said
     (r'"machine": \{.*?\}', '"machine": 3', "machine is 3, but"),
     ('"ppo"', '"a,b"', "config.variant is 'a,b', but"),
     (r'"seed": \d+', r'"seed": "\\n7\\n"', "config.seed is '.n7.n', but"),
+    (r'"seed": \d+', '"seed": -5', "config.seed is -5, but"),
     (r'"episodes": \d+', '"episodes": "3"', "config.episodes is '3', but"),
+    (r'"episodes": \d+', '"episodes": 0', "config.episodes is 0, but"),
+    (r'"seconds": [0-9.]+', '"seconds": "3"', "seconds is '3', but"),
     ('"CartPole-v1"', '"CartPole-v1,0"', "config.environment is 'CartPole-v1,0', but"),
 ]
 
@@ -218,7 +223,7 @@ IMPOSSIBLE = [
 ]
 
 
-@pytest.mark.parametrize("text", ["episode\nx\n", "", "\x00", '"', *IMPOSSIBLE])
+@pytest.mark.parametrize("text", ["episode\nx\n", "episode\n1.5\n", "", "\x00", '"', *IMPOSSIBLE])
 def test_what_no_training_wrote_though_its_digest_is_right(trained, tmp_path, text):
     run = shutil.copytree(trained("CartPole-v1", "ppo", episodes=3), tmp_path / "run")
     record = json.loads((run / files.RECORD).read_text(encoding="utf-8"))

@@ -1,5 +1,6 @@
 """Standard output and error that end no training if a terminal, a pipe or a disk fails."""
 
+import errno
 import io
 import os
 import sys
@@ -10,8 +11,11 @@ class Outlet(io.FileIO):
     """Descriptor 1 or 2; after its first `error` it is /dev/null."""
 
     error: OSError | None = None
+    was_closed = False  # and is /dev/null already, which is no place for what is asked for
 
     def write(self, data: Any) -> int:
+        if self.was_closed and not self.error:
+            self.error = OSError(errno.EBADF, os.strerror(errno.EBADF))
         try:
             written: int | None = super().write(data)  # None: it would block
         except OSError as error:
@@ -20,25 +24,29 @@ class Outlet(io.FileIO):
         return len(data) if written is None else written
 
 
-def keep_open(descriptor: int) -> None:
+def keep_open(descriptor: int) -> bool:
     """Open /dev/null in place of a closed descriptor: the next file would get its number.
 
-    For reading alone, so that writing fails, as it does where it is closed.
+    Returns whether it was closed.
     """
     try:
         os.fstat(descriptor)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_RDONLY), descriptor)
+        os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
         os.set_inheritable(descriptor, True)  # dup2 does not if it got this number itself
+        return True
+    return False
 
 
 def secure() -> None:
     """Replace `sys.stdout` and `sys.stderr` by `Outlet`s, unless the program has replaced them."""
     for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
-        keep_open(descriptor)
+        was_closed = keep_open(descriptor)
         stream = getattr(sys, name)
         if descriptor and stream is getattr(sys, f"__{name}__"):
-            outlet = io.BufferedWriter(Outlet(descriptor, "w", closefd=False))
+            outlet = Outlet(descriptor, "w", closefd=False)
+            outlet.was_closed = was_closed
             encoding = stream.encoding if stream else "utf-8"
-            text = io.TextIOWrapper(outlet, encoding, "backslashreplace", line_buffering=True)
+            buffer = io.BufferedWriter(outlet)
+            text = io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=True)
             setattr(sys, name, text)

@@ -24,9 +24,10 @@ BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
     if of_gymnasium := {"id", "max_episode_steps", "disable_env_checker"} & set(arguments):
+        beside = "max_episode_steps" in of_gymnasium
         raise ValueError(
-            f"{min(of_gymnasium)!r} is not for the environment's constructor; the time limit is"
-            " the setting max_episode_steps beside environment_arguments"
+            f"{min(of_gymnasium)!r} is not for the environment's constructor"
+            + beside * "; max_episode_steps is a setting beside environment_arguments"
         )
     return arguments
 

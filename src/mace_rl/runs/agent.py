@@ -105,7 +105,9 @@ class Player:
     def _load(self, state: dict[str, Any], path: Path) -> None:
         wanted = self.agent.state_dict()
         for name in [*wanted, *state]:
-            found, right = _kind(state.get(name)), _kind(wanted.get(name))
+            found, right = (
+                _kind(kept[name]) if name in kept else "missing" for kept in (state, wanted)
+            )
             if found != right:
                 raise CheckpointError(f"{path}: {name} is {found}, but should be {right}")
             bad = state[name].isnan() if name == "policy.clip" else ~state[name].isfinite()
@@ -132,4 +134,4 @@ def _kind(entry: Any) -> str:
     """The type and shape of an entry of a state, for messages."""
     if isinstance(entry, Tensor) and not entry.is_nested:  # which has no shape
         return f"{entry.device} {entry.layout} {entry.dtype} of shape {tuple(entry.shape)}"
-    return "missing" if entry is None else f"a {type(entry).__name__}"
+    return f"a {type(entry).__name__}"

@@ -73,7 +73,7 @@ class FinishedRun:
         except ConfigError as error:
             if self.record["sources"] == sources.digest("training"):
                 raise
-            reason = f"{error}; this run was trained by other code, which may have had other keys"
+            reason = f"{error}; this run may be of other code, which took other settings"
             raise ConfigError(reason) from None
         for key, text in ({} if self.trust else code_outside(values)).items():
             raise ConfigError(
@@ -129,7 +129,12 @@ class FinishedRun:
         path = self.folder / files.DIAGNOSTICS
         content = io.BytesIO(self.content(path.name)) if path.exists() else None
         try:
-            return pd.read_csv(content, dtype=float).astype({"episode": int}) if content else None
+            table = pd.read_csv(content, dtype=float) if content else None
+            if table is not None:
+                if not (table["episode"].between(1, 2**53) & (table["episode"] % 1 == 0)).all():
+                    raise ValueError("no training writes such episodes")
+                table = table.astype({"episode": int})
+            return table
         except (KeyError, ValueError):
             raise RecordError(f"{path}: {NEVER_WRITTEN}") from None
 
@@ -169,7 +174,10 @@ def finished(config: RunConfig, directory: Path) -> bool:
         return False
     run = FinishedRun(directory, trust=True)  # it is only compared
     wanted = identity(config)
-    found = {key: run.record[key] for key in wanted} | {"config": run.config.settings()}
+    try:
+        found = {key: run.record[key] for key in wanted} | {"config": run.config.settings()}
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {WAY_OUT}") from None
     if found != wanted:
         what = f"a finished run {otherwise(found, wanted, config)}"
         raise ConfigError(f"{directory} holds {what}; {WAY_OUT}")

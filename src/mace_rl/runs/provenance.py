@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from mace_rl import sources
 from mace_rl.config.plugins import source_files
@@ -33,8 +33,8 @@ class RecordedConfig(BaseModel):
 
     environment: str = Field(pattern=r"^[A-Za-z0-9._:/-]+$")  # cells of the table of `export`
     variant: str = Field(pattern=r"^[A-Za-z0-9._-]+$")
-    seed: int
-    episodes: int
+    seed: int = Field(ge=0, lt=2**32)
+    episodes: PositiveInt
 
 
 class RunRecord(BaseModel):
@@ -47,6 +47,7 @@ class RunRecord(BaseModel):
     sources: str
     machine: dict[str, Any]
     outputs: dict[str, str]
+    seconds: float
 
 
 class GitError(Refusal, RuntimeError):
