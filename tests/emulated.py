@@ -37,7 +37,7 @@ def train(environment: str, variant: str, folder: str, halt: bool) -> None:
         if progress["episode"] > config.episodes // 2:
             raise Interrupted
 
-    every_round = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "OBSERVER_SECONDS": 0.0}
+    every_round = {"CHECKPOINT_SECONDS": 0.0, "CHECKPOINT_COST": 1e9, "PROGRESS_SECONDS": 0.0}
     try:
         with patch.multiple(run, **every_round):
             run.run(config, Path(folder), interrupt)

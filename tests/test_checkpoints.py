@@ -194,10 +194,12 @@ def test_a_time_between_checkpoints_that_cannot_be(run_config, tmp_path, monkeyp
 def test_checkpoints_cost_at_most_one_percent(monkeypatch, cost, wait):
     now = [1000.0]
     monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    clock = run.Clock(900.0, 2.0)
+    clock = run.Clock(900.0)
     clock.checkpoint_seconds = 0.7  # before an interruption
     assert clock.elapsed() == 100 and not clock.checkpoint_due()
-    now[0] += 10
+    now[0] += 2  # the first comes soon
+    assert clock.checkpoint_due()
+    now[0] += 8
     assert clock.checkpoint_due()
     with clock.saving():
         now[0] += cost

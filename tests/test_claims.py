@@ -299,7 +299,7 @@ MISTAKES = [  # one text for another, and what is said of it
     ("    C2:", "    Q1:", ["elsewhere.claims.Q1", "twice"]),
     ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
     (
-        "public_code: [sample_efficiency, ",
+        "public_code: [sample_efficiency_public_code, ",
         "public_code: [",
         ["table1.public_code", "in this order"],
     ),

@@ -56,6 +56,17 @@ def test_runs_behind_links_are_there_and_once(runs, monkeypatch, tmp_path, capsy
     assert "2 of 2 runs equal" in capsys.readouterr().out
 
 
+def test_runs_of_one_name_are_told_apart_by_their_folder(runs, monkeypatch, tmp_path):
+    shutil.copytree(runs / "ppo", runs / "a, again")
+    assert call(monkeypatch, "export", str(runs), "--out", str(tmp_path / "x.csv")) == (0, "")
+    folders = pd.read_csv(tmp_path / "x.csv").groupby("folder")["algorithm"].agg(["first", "size"])
+    assert folders.to_dict("index") == {
+        "a? again/seed0": {"first": "ppo", "size": 6},
+        "mace_full/seed1": {"first": "mace_full", "size": 6},
+        "ppo/seed0": {"first": "ppo", "size": 6},
+    }
+
+
 def test_the_page_s_interquartile_mean(trained, monkeypatch, tmp_path, capsys):
     """Of the last tenth of 10 episodes, the last one, over 4 seeds: the mean of the middle two."""
     for seed in range(4):
@@ -79,8 +90,6 @@ def test_mistakes_get_one_line(runs, monkeypatch, tmp_path):
     assert (tmp_path / "mine.csv").read_text() == "x,y\n1,2\n"
     assert "--out is " in said_of("x.json") and "end in .csv or .parquet" in said_of("x.json")
     assert "pip install pyarrow" in said_of("x.parquet")  # the lock is without; test-wheel has it
-    shutil.copytree(runs / "ppo", runs / "again")
-    assert "CartPole-v1 ppo seed 0 is in" in said_of("x.csv")
     assert not [*tmp_path.glob("x.*")]
 
 

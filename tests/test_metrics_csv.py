@@ -31,6 +31,7 @@ ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "convergence_steps_steepest": 300,  # both windows of 50 at 500: episodes 201 to 300
     "convergence_steps_flattest": 100,
     "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
+    "sample_efficiency_public_code": 201,
 }
 EPISODES = [metric.name for metric in m.METRICS if metric.unit == "episodes"]
 ROW |= dict.fromkeys((f"{name}_censored" for name in EPISODES), 0)
@@ -123,7 +124,7 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
     )
     result = table(settings=settings)
     added = ["positive", "worst", "positive_censored"]
-    assert list(result.columns) == [*COLUMNS[:17], *added[:2], *COLUMNS[17:], added[2]]
+    assert list(result.columns) == [*COLUMNS[:18], *added[:2], *COLUMNS[18:], added[2]]
     pd.testing.assert_frame_equal(result[COLUMNS], table())
     for row, run in zip(result[added].itertuples(index=False), runs().values(), strict=True):
         returns = run["extrinsic_return"].tolist()

@@ -56,7 +56,7 @@ DONE = {"seconds": 130.0, "start_seconds": 30.0}
 
 
 def test_the_table(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no workflow has begun here"):
+    with pytest.raises(ConfigError, match="no run in it or below it, and no logs"):
         status(tmp_path)
     folder = Folder(tmp_path, cores=2)
     folder.add(record=DONE, due=False, old=("record",))  # by an earlier workflow
@@ -72,6 +72,20 @@ def test_the_table(tmp_path: Path) -> None:
         "A ppo 2 50/100 21.5 0.25 1830 60 s",
         "A ppo 3 starting",
         "A ppo 4 90/100 21.5 0.25 1830 stopped",
+    ]
+
+
+def test_runs_without_a_workflow(tmp_path: Path) -> None:
+    folder, named = Folder(tmp_path, cores=None), {"environment": "E", "variant": "ppo", "seed": 3}
+    folder.add("A", record=DONE | {"config": named})
+    folder.add("B", told=told(50, 60.0) | named, held=True)
+    folder.add("C", told=told(90, 60.0) | named)
+    heading, names, *rows = [" ".join(line.split()) for line in status(tmp_path)]
+    assert heading == "1 of 3 runs done, 1 running, 1 stopped; about 60 s left"
+    assert names == "folder environment variant seed episode return β steps/s left"
+    assert rows == [
+        "runs/B/ppo/seed1 E ppo 3 50/100 21.5 0.25 1830 60 s",
+        "runs/C/ppo/seed2 E ppo 3 90/100 21.5 0.25 1830 stopped",
     ]
 
 
@@ -116,7 +130,12 @@ def test_seconds_left_by_hand(tmp_path: Path, runs, cores, expected, unknown) ->
     folder = Folder(tmp_path, cores)
     for run in runs:
         folder.add(**run)
-    planned = [Run(Planned(**run), tmp_path, 1000.0) for run in folder.plan["runs"]]
+    places = [
+        tmp_path / "runs" / run["env"] / run["variant"] / f"seed{run['seed']}"
+        for run in folder.plan["runs"]
+    ]
+    plan = zip(folder.plan["runs"], places, strict=True)
+    planned = [Run(Planned(**run), place, 1000.0) for run, place in plan]
     seconds, without = seconds_left(planned, cores)
     assert (seconds, without) == (pytest.approx(expected), unknown)
 

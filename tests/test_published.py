@@ -126,7 +126,7 @@ def test_it_resumes_and_repeats_to_the_bit(
     tmp_path, monkeypatch, checkpoint_every, completes, environment
 ):
     monkeypatch.setattr(published, "CAPACITY", 20)
-    monkeypatch.setattr(run, "OBSERVER_SECONDS", 0.0)
+    monkeypatch.setattr(run, "PROGRESS_SECONDS", 0.0)
     config, folder = make(environment, published={"novelty_buffer_fills": True}), tmp_path / "run"
 
     def interrupt(progress):

@@ -204,7 +204,7 @@ def observe(progress):
     print(json.dumps([threads, own, progress["episode"]]), flush=True)
     time.sleep(600)
 
-run.CHECKPOINT_COST, run.OBSERVER_SECONDS = float("inf"), 0.0
+run.CHECKPOINT_COST, run.PROGRESS_SECONDS = float("inf"), 0.0
 run.run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), observe)
 """
 

@@ -23,9 +23,9 @@ import numpy as np
 import pandas as pd
 
 from mace_rl.config.reading import read_yaml
-from mace_rl.study.claims_config import ClaimsConfig, Part, parts_of
+from mace_rl.study.claims_config import FEWEST_SEEDS, ClaimsConfig, Part, parts_of
 from mace_rl.study.compare.direction_and_size import decided
-from mace_rl.study.compare.estimates import FEWEST_SEEDS, LEVEL, Pair, find, pairs_of
+from mace_rl.study.compare.estimates import LEVEL, Pair, find, pairs_of
 from mace_rl.study.compare.ledger import SizedFinding
 from mace_rl.study.compare.verdicts import ledger
 from mace_rl.study.config import read_study

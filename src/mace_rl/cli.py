@@ -5,6 +5,8 @@ import mace_rl.pins  # noqa: F401  isort: skip  (before NumPy: equal bits on eve
 import argparse
 import logging
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -63,8 +65,9 @@ def parser() -> argparse.ArgumentParser:
     add("--out", type=path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
     anew = "move a run that is in the folder into a folder below it, and train from the start"
     add("--restart", **flag, help=anew)
-    does = "print how far the workflow's runs are, and about when they will be done"
-    command("status", status, does, "results/reduced", folder="the workflow's results folder")
+    does = "print how far runs are, and about when they will be done"
+    where = "a workflow's results folder, or any with runs in or below it"
+    command("status", status, does, "results/reduced", folder=where)
     play = "play episodes with a trained agent and print its returns"
     film = "write an animated GIF of the first episodes that evaluate plays"
     for name, function, does, example, episodes in (
@@ -166,8 +169,8 @@ def watch(arguments: argparse.Namespace) -> None:
     _require(arguments.seconds > 0, "--seconds", arguments.seconds, "be greater than 0")
     _require(50 <= arguments.width <= 2000, "--width", arguments.width, "be from 50 to 2000")
     name = "watch_untrained.gif" if arguments.untrained else "watch.gif"
-    out: Path = arguments.out or arguments.folder / name
-    _require(out.suffix == ".gif", "--out", str(out), "end in .gif")
+    out: Path = (arguments.out or arguments.folder / name).absolute()
+    _require(out.suffix == ".gif", "--out", str(arguments.out), "end in .gif")
     files.require_ours(out, b"GIF8")
     _require_playable(arguments)
     from mace_rl.runs import watch
@@ -206,6 +209,14 @@ def verify(arguments: argparse.Namespace) -> None:
         print(line, flush=True)
 
 
+def in_a_file(error: Exception) -> str:
+    """An error of somebody else's code in a line, and where its traceback is."""
+    with tempfile.NamedTemporaryFile("w", prefix="mace-rl-", suffix=".txt", delete=False) as file:
+        file.writelines(traceback.format_exception(error))
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"{said} (traceback: {file.name})"
+
+
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
     outlets.secure()
@@ -213,14 +224,16 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         arguments.run(arguments)
-    except (Refusal, OSError, MemoryError) as error:
+    except Exception as error:
+        if not isinstance(error, Refusal) and (where := getattr(error, "__notes__", ())):
+            sys.exit(f"mace-rl: {', '.join(reversed(where))}: {in_a_file(error)}")
+        if isinstance(error, ModuleNotFoundError):
+            extra = "tensorboard" if arguments.command == "tensorboard" else "study"
+            sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
+        if not isinstance(error, Refusal | OSError | MemoryError):
+            raise
         bare = "out of memory" if isinstance(error, MemoryError) else repr(error)
         sys.exit(f"mace-rl: {' '.join(str(error).split()) or bare}")
-    except ModuleNotFoundError as error:
-        if arguments.command == "train":  # in the user's own code, whose place the traceback tells
-            raise
-        extra = "tensorboard" if arguments.command == "tensorboard" else "study"
-        sys.exit(f"mace-rl: {error}; mace-rl's extra [{extra}] has it")
     except SystemExit as error:  # a module of the user's own, where it is imported or made
         sys.exit(f"mace-rl: code of the environment or of a plugin ended the program: {error!r}")
     except KeyboardInterrupt:

@@ -83,17 +83,30 @@ class CuriosityTracker(Stateful):
         extrinsic, curiosity = self.scales.values()
         return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
 
-    def begin(self, environment: int, observation: Any) -> None:
-        """Start an episode; an unfinished one is forgotten."""
+    def begin(self, environment: int, observation: Any, afresh: bool = False) -> None:
+        """Start an episode; one that is not over ends here, or is forgotten if all begins afresh."""
+        unfinished = self.recordings[environment]
+        if unfinished is not None and unfinished.rewards and not afresh:
+            self.end(environment, terminated=False)
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
         require_within("β", beta, largest=LARGEST_BETA)
         self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
 
+    def taken(self, action: Any) -> Any:
+        """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
+        space = self.spaces.action_space
+        if isinstance(space, Discrete):
+            return int(action) - int(space.start)
+        return np.array(action, np.float32)
+
     def reward_parts(
         self, environment: int, action: Any, reward: Any, observation: Any
     ) -> dict[str, float]:
-        """`PARTS` of the reward for a step, from its extrinsic reward and next observation."""
-        recording, space = self.recordings[environment], self.spaces.action_space
+        """`PARTS` of the reward for a step, from its extrinsic reward and next observation.
+
+        action: from `taken`, before the step, since an environment may write into the one it gets.
+        """
+        recording = self.recordings[environment]
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
         step = len(recording.rewards) + 1
@@ -106,10 +119,7 @@ class CuriosityTracker(Stateful):
             bonus = max(bonus, 0.0)
         if self.spaces.discrete_observations:
             recording.visits += state
-        if isinstance(space, Discrete):
-            recording.actions.append(int(action) - int(space.start))
-        else:
-            recording.actions.append(np.array(action, np.float32))  # a copy
+        recording.actions.append(action)
         recording.observations.append(state)
         recording.rewards.append(reward)
         recording.bonus.append(bonus)

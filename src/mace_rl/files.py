@@ -1,7 +1,9 @@
 """The files of a run, and how files are written and found."""
 
+import errno
 import itertools
 import os
+import stat
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
@@ -36,6 +38,14 @@ def write_atomically(path: str | Path, content: str | bytes) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def content(path: str | Path) -> bytes:
+    """The bytes of a file; `OSError` for a pipe or a device, whose reader might wait for ever."""
+    with open(path, "rb", opener=lambda name, how: os.open(name, how | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+        return file.read()
 
 
 def set_aside(folder: Path, names: Iterable[str]) -> Path:
@@ -74,5 +84,5 @@ def runs_below(folder: Path, names: Collection[str]) -> list[Path]:
 
 def require_ours(out: Path, begins: bytes) -> None:
     """`Refusal` if there is something at `out` that does not begin with these bytes."""
-    if out.is_dir() or (out.exists() and out.read_bytes()[: len(begins)] != begins):
+    if out.is_dir() or (out.exists() and content(out)[: len(begins)] != begins):
         raise Refusal(f"{out}: there already, and not written by this command; choose another name")

@@ -83,7 +83,7 @@ def train(
     from mace_rl.runs.run import run
 
     with tempfile.TemporaryDirectory() as scratch:
-        directory = Path(folder or scratch)
+        directory = Path(folder or scratch).absolute()
         if restart or not finished(settings, directory):
             run(settings, directory, None, False, callback, "all" if restart else "nothing")
         return Trained(load_agent(directory, trust=True), FinishedRun(directory).rows)

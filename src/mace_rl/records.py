@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar, get_type_hints
 
 import numpy as np
 
+from mace_rl import files
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
 
@@ -138,7 +139,7 @@ def read_table(
     import pandas as pd
 
     try:
-        content = Path(path).read_bytes()
+        content = files.content(path)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     known = hashlib.sha256(content).hexdigest() == digest

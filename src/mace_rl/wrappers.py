@@ -12,7 +12,8 @@ as much as those of the extrinsic reward, or 0.4 if these vary by less than 1.
 
 β and u are constant during an episode. At its end the episode becomes memory, novelty is updated,
 and β and u are set for the next. In the first episode u is 0: no bonus is paid yet. An episode that
-is reset before it ends is forgotten.
+is reset before it ends, as by a time limit around this wrapper, ends there; where `reset` gets a
+seed, so that all begins afresh, it is forgotten.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.curiosity_tracker import PARTS, CuriosityTracker
-from mace_rl.environments.spaces import Spaces, require_vectors
+from mace_rl.environments.spaces import Spaces
 
 Settings = Mapping[str, Any]
 
@@ -59,7 +60,6 @@ class CuriosityMixin(RecordConstructorArgs):
                     f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
                     " but it should be one of gymnasium.vector.AutoresetMode"
                 )
-        require_vectors(name_of(env), spaces[0])
         self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
 
     def state_dict(self) -> dict[str, Any]:
@@ -78,9 +78,9 @@ class CuriosityMixin(RecordConstructorArgs):
 class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
-    env: observations are Box (flattened) or Discrete, actions Discrete or one-dimensional Box;
-        Gymnasium's `FlattenObservation` makes vectors of others. Episodes have to end, if need be
-        by a time limit: nothing is learned from one that does not.
+    env: observations are of any space that has a flat form, and the agent gets them unchanged;
+        actions are Discrete or one-dimensional Box. Episodes have to end, by a time limit or a
+        reset: nothing is learned from one that does not.
     beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …} or "custom". Not "meta", which asks for policy gradients.
     relevance: False for novelty alone, without memory; `memory` is then refused.
@@ -104,13 +104,14 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        self.tracker.begin(0, observation)
+        self.tracker.begin(0, observation, afresh=seed is not None)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
+        taken = self.tracker.taken(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        parts = self.tracker.reward_parts(0, action, reward, observation)
+        parts = self.tracker.reward_parts(0, taken, reward, observation)
         if terminated or truncated:
             self.tracker.end(0, bool(terminated))
         total = parts["reward_extrinsic"] + parts["reward_curiosity"]
@@ -134,11 +135,12 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
         chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
         observations, infos = self.env.reset(seed=seed, options=options)
         for i in np.flatnonzero(chosen).tolist():
-            self.tracker.begin(i, observations[i])
+            self.tracker.begin(i, observations[i], afresh=seed is not None)
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """The environments' step, with other rewards, float64, and more in `infos`."""
+        taken = [self.tracker.taken(action) for action in actions]
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
         reached = observations
@@ -149,7 +151,7 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
         fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
         values = np.zeros((len(PARTS), self.num_envs))
         for i in np.flatnonzero(~fresh).tolist():
-            parts = self.tracker.reward_parts(i, actions[i], rewards[i], reached[i])
+            parts = self.tracker.reward_parts(i, taken[i], rewards[i], reached[i])
             values[:, i] = list(parts.values())
         for i in np.flatnonzero(ended).tolist():
             self.tracker.end(i, bool(terminated[i]))

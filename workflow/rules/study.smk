@@ -15,7 +15,7 @@ from mace_rl.config.section import ConfigError
 from mace_rl.study.config import folder_of, load_study
 from mace_rl.config.plugins import code_outside, source_files
 from mace_rl.environments import registered
-from mace_rl.study.claims_config import read_claims
+from mace_rl.study.claims_config import FEWEST_SEEDS, read_claims, too_few
 from mace_rl.study.measure.metrics import all_metrics
 from mace_rl.runs import provenance, queueing
 from mace_rl.sources import digest
@@ -57,6 +57,9 @@ READ = ["readings"] if set(COUNTED) & set(paper.table1.metrics) else []
 # The ledger is for a study that has all that a family of claims is about.
 LACKING = paper.lacking(study.environments, study.variants, MEASURED)
 LEDGER = {} if all(LACKING.values()) else {"ledger": f"{RESULTS}/claims.json"}
+FEWEST_OF_A_STUDY = min(
+    len(study.environment_seeds.get(env, study.seeds)) for env in FOLDERS.values()
+)
 # Those that the configuration has the numbers for.
 DRAWN = {"constants": MEASURED.constants, "solved": MEASURED.solved_return, "forest": LEDGER}
 PICTURES = ["every_seed", *(picture for picture, numbers in DRAWN.items() if numbers)]

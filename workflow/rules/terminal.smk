@@ -60,9 +60,13 @@ def in_short(record):
 
 
 def outcome():
-    """Table 1, if it is among what was asked for, and where all of this lies."""
-    made = {str(path) for job in workflow.dag.jobs for path in job.output}
+    """Table 1, if it is among what was asked for, and where all of this lies.
+
+    Only of files that are there: with --touch, --until and the like Snakemake makes not all of them.
+    """
+    wanted = {str(path) for job in workflow.dag.jobs for path in job.output}
     asked = {str(path) for job in workflow.dag.targetjobs for path in job.output}
+    made = set(filter(os.path.exists, wanted))
     lines = []
     if f"{RESULTS}/table1.csv" in made:
         import pandas  # only now: it takes as long as planning
@@ -74,9 +78,18 @@ def outcome():
         table = tables.table1(tables.named(data, study.labels), MEASURED, paper.table1)
         lines = [f"\n{title()}\n", markdown.plain(table), ""]
     lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
-    lines += textwrap.wrap(", ".join([*lie, *sorted(asked.difference(lie))]), 100)
+    others = sorted(asked.intersection(made).difference(lie))
+    if len(others) > MOST_NAMED:
+        others = [f"{len(others)} files more in {RESULTS}"]
+    lines += textwrap.wrap(", ".join([*lie, *others]), 100)
+    of_all = {str(path) for job in workflow.dag.targetjobs if not job.output for path in job.input}
+    if missing := sorted(path for path in asked | of_all if not os.path.exists(path)):
+        more = f" and {len(missing) - 1} more" if missing[1:] else ""
+        lines.append(f"Not there, and not made now: {missing[0]}{more}")
     if f"{RESULTS}/tables.md" in made and f"{RESULTS}/report.html" not in made:
-        lines.append(f"All of it on one page: {COMMAND.replace('all', 'page', 1)}")
+        here = os.path.realpath("Snakefile") == os.path.realpath(workflow.main_snakefile)
+        where = "" if here else f" -s {shlex.quote(os.path.relpath(workflow.main_snakefile))}"
+        lines.append(f"All of it on one page: {COMMAND.replace(' all', f'{where} page', 1)}")
     return "\n".join(lines)
 
 
@@ -90,6 +103,7 @@ def title():
 
 
 SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
+MOST_NAMED = 24  # other files, by name
 LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
 
@@ -112,10 +126,14 @@ onstart:
     for line in study.metrics.incomplete(study.environments, study.variants):
         logger.info(line)
     for title, lacking in {} if LEDGER else LACKING.items():
-        logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
-    due = sum(run["due"] for run in planned["runs"])
-    to_train = f"{due} of {len(RUNS)} runs to train"
-    logger.info(f"{to_train}; how far they are: mace-rl status {RESULTS}")
+        if not set(lacking).intersection(registered()):  # about environments that it has
+            logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
+    if LEDGER and FEWEST_OF_A_STUDY < FEWEST_SEEDS:
+        logger.info(f"no claim can have a verdict: {too_few(FEWEST_OF_A_STUDY)}")
+    due, runs = sum(run["due"] for run in planned["runs"]), len(planned["runs"])
+    if workflow.executor_plugin.name != "touch":
+        to_train = f"{due} of {runs} runs to train"
+        logger.info(f"{to_train}; how far they are: mace-rl status {RESULTS}")
 
 
 onsuccess:

@@ -12,7 +12,7 @@ from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import animations, curves, report, sections
 
 with job(snakemake):
-    found, given, output = snakemake.input, snakemake.params, Path(snakemake.output[0])
+    found, given, output = snakemake.input, snakemake.params, Path(snakemake.output[0]).absolute()
     settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
     data, answers = sections.read_data(dict(found.items()), given.runs, settings)
     ppo = {env: PPOConfig.model_validate(own) for env, own in given.ppo.items()}

@@ -113,6 +113,20 @@ class Environment(Spaces):
             if not isinstance(kept := self.env.unwrapped.np_random, np.random.Generator):
                 raise TypeError(f"np_random is a {type(kept).__name__}, not a Generator of NumPy's")
 
+    def reset(self) -> Any:
+        """The first observation of an episode."""
+        try:
+            return self.env.reset()[0]
+        except Exception as error:
+            error.add_note(f"in a reset of {self.name}")
+            raise
+
+    def within(self, action: np.ndarray) -> np.ndarray:
+        """A new array, [actions]: the action as the environment gets it, of its space."""
+        space: Any = self.action_space
+        given = action.clip(space.low, space.high) if self.clips_actions else action.copy()
+        return given if np.can_cast(given.dtype, space.dtype) else given.astype(space.dtype)
+
     def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
         """Observation, reward and flags, checked; `action` is the `number`th of an episode."""
         try:

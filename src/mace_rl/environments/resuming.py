@@ -4,6 +4,8 @@ import copy
 import hashlib
 import itertools
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -28,11 +30,7 @@ def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any
         "np_random": _plain(environment.generator.bit_generator.state),
         "own": copy.deepcopy(env.get_wrapper_attr("state_dict")()) if offers else None,
     }
-    if of_process:
-        state["random"] = random.getstate()
-        state["numpy"] = _plain(np.random.get_state(legacy=False))  # noqa: NPY002
-        state["torch"] = torch.get_rng_state()
-    return state
+    return state | global_state() if of_process else state
 
 
 def set_state(environment: Environment, state: dict[str, Any]) -> None:
@@ -42,9 +40,37 @@ def set_state(environment: Environment, state: dict[str, Any]) -> None:
         env.get_wrapper_attr("load_state_dict")(copy.deepcopy(state["own"]))
     environment.generator.bit_generator.state = state["np_random"]
     if "random" in state:
-        random.setstate(state["random"])
-        np.random.set_state(state["numpy"])  # noqa: NPY002
-        torch.set_rng_state(state["torch"])
+        set_global_state(state)
+
+
+def global_state() -> dict[str, Any]:
+    """That of Python's, NumPy's and PyTorch's global generators."""
+    return {
+        "random": random.getstate(),
+        "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002
+        "torch": torch.get_rng_state(),
+    }
+
+
+def set_global_state(state: dict[str, Any]) -> None:
+    """Restore what `global_state` returned."""
+    random.setstate(state["random"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(state["torch"])
+
+
+@contextmanager
+def seeded(seed: np.random.SeedSequence) -> Iterator[None]:
+    """Code that draws from the global generators repeats itself; afterwards they are as before."""
+    before = global_state()
+    first, *others = seed.generate_state(6).tolist()
+    random.seed(first)
+    np.random.seed(others[:4])  # noqa: NPY002
+    torch.manual_seed(others[4])
+    try:
+        yield
+    finally:
+        set_global_state(before)
 
 
 class LastEpisodes:

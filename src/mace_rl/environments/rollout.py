@@ -51,17 +51,15 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
     log_probs = np.empty(len(noise), np.float32)
     rewards = np.empty(len(noise))
-    observations[0] = environment.encode(environment.env.reset()[0], 0)
+    observations[0] = environment.encode(environment.reset(), 0)
     terminated = truncated = False
     t = 0
     while not (terminated or truncated):
         action: Any
         action, log_prob = policy.act(observations[t], noise[t])
-        env_action = action + int(space.start) if discrete else action
-        if not discrete and environment.clips_actions:
-            env_action = action.clip(space.low, space.high)
-        observation, reward, terminated, truncated = environment.step(env_action, t + 1)
-        actions[t], log_probs[t], rewards[t] = action, log_prob, reward
+        actions[t], log_probs[t] = action, log_prob
+        env_action = action + int(space.start) if discrete else environment.within(action)
+        observation, rewards[t], terminated, truncated = environment.step(env_action, t + 1)
         t += 1
         observations[t] = environment.encode(observation, t)
     # Copies: an episode that ended early should not hold the memory of a whole one.

@@ -10,27 +10,31 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
-MOST_NUMBERS = 10**6  # in an observation or an action: networks have a row for each
+MOST_NUMBERS = 10**4  # in an observation or an action: each is a row of networks and memory
+FLAT = (Box, Discrete, MultiBinary, MultiDiscrete)  # spaces that are vectors, or become some
 NUMBERS = "biuf"  # NumPy's kinds of numbers
 
 
 class Spaces:
     """The spaces of an environment; `name` is for messages. `ConfigError` for unsupported ones.
 
-    Observations become flat float32 vectors, Discrete ones one-hot vectors.
+    Observations become flat float32 vectors, as Gymnasium's `flatten` makes them: a state of a
+    Discrete or MultiDiscrete space is one-hot, an image is a row of numbers.
     """
 
     def __init__(
         self, name: str, observations: gymnasium.Space[Any], actions: gymnasium.Space[Any]
     ) -> None:
-        require_vectors(name, observations, parts=isinstance(observations, Dict | Tuple))
+        require_flat(name, observations)
+        require_size(name, observations)
         self.given_space = observations  # of what `encode` gets
-        if isinstance(observations, Dict | Tuple):
+        if not isinstance(observations, Box | Discrete):
             observations = gymnasium.spaces.flatten_space(observations)
         box = isinstance(actions, Box) and len(actions.shape) == 1
         if not (box or isinstance(actions, Discrete)):
             raise ConfigError(
-                f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box work"
+                f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box "
+                "work, of which gymnasium.wrappers.TransformAction makes others"
             )
         require_size(name, actions)
         assert isinstance(observations, Box | Discrete) and isinstance(actions, Box | Discrete)
@@ -85,21 +89,18 @@ class Spaces:
         return number
 
 
-def require_vectors(name: str, space: gymnasium.Space[Any], parts: bool = False) -> None:
-    """Raise `ConfigError` unless observations are vectors; parts: of a Dict or Tuple."""
-    if parts and isinstance(space, Dict | Tuple) and len(space):
-        for part in space.values() if isinstance(space, Dict) else space:
-            require_vectors(name, part, parts=True)
-        return
-    works = (Box, Discrete, MultiBinary, MultiDiscrete) if parts else (Box, Discrete)
-    image = isinstance(space, Box) and len(space.shape) >= 2 and space.dtype == np.uint8
-    if image or not isinstance(space, works):
-        kind = "image" if image else type(space).__name__.lower()
+def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> None:
+    """Raise `ConfigError` unless observations are vectors, or become some; entry: of a Dict."""
+    if isinstance(space, Dict | Tuple) and len(space):
+        for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
+            require_flat(name, part, f"{entry}[{key!r}]")
+    elif not isinstance(space, FLAT):
+        what = f"the observation{entry} is of {short_repr(space)}"
         raise ConfigError(
-            f"environment {name!r} has {kind} observations, {space}; Box (vectors) and Discrete "
-            "ones work"
+            f"environment {name!r}: {what}, and not so many numbers at every step; "
+            "gymnasium.wrappers.FilterObservation leaves an entry out, TransformObservation makes "
+            "numbers of it"
         )
-    require_size(name, space)
 
 
 def require_size(name: str, space: gymnasium.Space[Any]) -> None:
@@ -113,10 +114,10 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
 
 
 def _array(given: Any, space: gymnasium.Space[Any] | None = None) -> np.ndarray:
-    """As an array, a vector for a Dict or Tuple; an array without numbers if that is impossible."""
+    """As an array, a vector for a Dict, Tuple or MultiDiscrete; without numbers if it is none."""
     # NumPy, PyTorch and Gymnasium raise these if it is.
     with suppress(AttributeError, LookupError, TypeError, ValueError, RuntimeError):
-        if not isinstance(space, Dict | Tuple):
+        if not isinstance(space, Dict | Tuple | MultiDiscrete):
             return np.asarray(given)
         if _has_parts(given, space):
             return np.asarray(gymnasium.spaces.flatten(space, given))

@@ -33,16 +33,39 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compiled(function: Callable[..., Any]) -> Any:
         before, config.CACHE_DIR = config.CACHE_DIR, str(FOLDER)
         try:
-            return numba.njit(**options)(function)
+            return without_full_disks(numba.njit(**options)(function))
         except RuntimeError as error:
             if "no locator available" not in str(error):
                 raise
             config.CACHE_DIR = spare_folder()
-            return numba.njit(**options)(function)
+            return without_full_disks(numba.njit(**options)(function))
         finally:
             config.CACHE_DIR = before
 
     return compiled
+
+
+def without_full_disks(function: Any) -> Any:
+    """The same compiled function; if its code cannot be kept, it goes on without, and warns."""
+    store = getattr(function, "_cache", None)  # nothing public is there
+    if store is None:
+        return function
+    save = store.save_overload
+
+    def save_if_possible(*compiled: Any) -> None:
+        try:
+            save(*compiled)
+        except OSError as error:
+            warn_unkept(f"{FOLDER.parent} ({error.strerror or error})")
+
+    store.save_overload = save_if_possible
+    return function
+
+
+@cache
+def warn_unkept(where: str) -> None:
+    said = "compiled code cannot be kept in %s, and the next start compiles it again"
+    logging.getLogger(__name__).warning(said, where)
 
 
 @cache  # so it warns once

@@ -48,8 +48,25 @@ class PolicyModule(TorchPolicy):
         `ObservationError` for other inputs.
         """
         rows = encoded(observations, self.space, len(self.mean)).to(self.mean.device)
-        seen = ((rows - self.mean) / self.std).clip(-self.clip, self.clip).float()
-        return super().forward(seen)
+        return super().forward(self.normalised(rows))
+
+    def normalised(self, rows: Tensor) -> Tensor:
+        """What the network sees of flat observations, [N, observation]."""
+        return ((rows - self.mean) / self.std).clip(-self.clip, self.clip).float()
+
+
+class Outputs(torch.nn.Module):
+    """Flat observations, float32 [N, observation] → logits of actions, or their means.
+
+    Plain PyTorch: a copy that `torch.jit.trace` or `torch.onnx.export` makes needs no mace_rl.
+    """
+
+    def __init__(self, policy: PolicyModule) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, rows: Tensor) -> Tensor:
+        return self.policy.network(self.policy.normalised(rows))
 
 
 class Agent(torch.nn.Module):
@@ -60,6 +77,11 @@ class Agent(torch.nn.Module):
         self.policy = PolicyModule(networks, space)
         critics = {kind: critic.module() for kind, critic in networks.critics.items()}
         self.critics = torch.nn.ModuleDict(critics)
+
+    @property
+    def outputs(self) -> Outputs:
+        """What the policy computes before it becomes a distribution, to export."""
+        return Outputs(self.policy)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from mace_rl import files
 from mace_rl.config.section import short_repr
 from mace_rl.files import write_atomically
 from mace_rl.refusal import Refusal
@@ -79,7 +80,7 @@ def save(path: Path, identity: dict[str, Any], state: dict[str, Any]) -> None:
 
 def read(path: Path) -> dict[str, Any]:
     """`identity` and `state` of any run's checkpoint; `CheckpointError` if it is damaged."""
-    digest, _, data = path.read_bytes().partition(b"\n")
+    digest, _, data = files.content(path).partition(b"\n")
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise CheckpointError(f"{path}: cut off or altered (its SHA-256 does not match)")
     content = unarchive(data, path)

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from mace_rl.environments.resuming import seeded
 from mace_rl.environments.rollout import draw_noise, rollout_for
 from mace_rl.numerics.arrays import total
 from mace_rl.runs.agent import Player
@@ -19,14 +19,15 @@ def evaluate(
     It samples actions as in training, or takes the most probable ones if `deterministic`. Both the
     environment and the actions draw from `seed`, so the environment draws the same either way.
     """
-    player = Player.of(FinishedRun(directory, trust))
+    drawn = np.random.SeedSequence(seed)  # by networks with dropout, and some environments
+    with seeded(drawn):
+        player = Player.of(FinishedRun(directory.absolute(), trust))
     environment, policy = player.environment, player.acting(deterministic)
     rollout = rollout_for(environment, policy)
     generator = np.random.default_rng(seed)
-    environment.env.reset(seed=seed)
     returns = np.empty(episodes)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # for a network with dropout
+    with seeded(drawn):
+        environment.env.reset(seed=seed)
         for episode in range(episodes):
             played = rollout(environment, policy, draw_noise(environment, generator))
             returns[episode] = total(played.rewards)

@@ -48,7 +48,7 @@ def write(run: Path, out: Path) -> None:
             writer.write(event.SerializeToString())
         writer.close()
         out.mkdir(parents=True, exist_ok=True)
-        write_atomically(out / files.EVENTS, path.read_bytes())
+        write_atomically(out / files.EVENTS, files.content(path))
 
 
 def read(run: Path) -> dict[str, pd.DataFrame]:

@@ -1,16 +1,16 @@
 """Finished runs as one tidy table, a row per episode, for other tools."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 from mace_rl import files
 from mace_rl.config.run import IDENTITY
 from mace_rl.files import write_atomically
-from mace_rl.records import RecordError
 from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
 
-RUN = ("task", "algorithm", "seed")  # environment, variant, seed
+RUN = ("task", "algorithm", "seed", "folder")  # environment, variant, seed, where the run is
 EPISODE = {"step": "env_steps", "return": "extrinsic_return"}  # our names of the other columns
 EPISODE |= {name: name for name in ("episode", "length", "beta")}
 
@@ -18,21 +18,21 @@ EPISODE |= {name: name for name in ("episode", "length", "beta")}
 def columns(folder: Path) -> dict[str, list[Any]]:
     """The table of every finished run in and below `folder`.
 
-    Raises `RecordError` if there are none, two are of the same name, or records are damaged.
+    Raises `RecordError` if there are none, or records are damaged.
     """
     table: dict[str, list[Any]] = {name: [] for name in (*RUN, *EPISODE)}
-    seen: dict[tuple[Any, ...], Path] = {}
     for run in FinishedRun.below(folder):
-        key = tuple(run.record["config"][name] for name in IDENTITY)
-        if key in seen:
-            name = "{} {} seed {}".format(*key)
-            raise RecordError(f"{run.folder}: {name} is in {seen[key]} too; export one alone")
-        seen[key] = run.folder
-        for name, value in zip(RUN, key, strict=True):
+        key = [run.record["config"][name] for name in IDENTITY]
+        for name, value in zip(RUN, [*key, in_a_cell(run.folder.relative_to(folder))], strict=True):
             table[name] += [value] * len(run.rows)
         for name, ours in EPISODE.items():
             table[name] += [getattr(row, ours) for row in run.rows]
     return table
+
+
+def in_a_cell(folder: Path) -> str:
+    """Its path, with '/' between names; what would end a cell of a CSV file stands as '?'."""
+    return re.sub(r'[,"\n\r]', "?", folder.as_posix())
 
 
 def write(table: dict[str, list[Any]], out: Path) -> None:

@@ -85,7 +85,7 @@ class FinishedRun:
     def content(self, name: str) -> bytes:
         """One of `files.RESULTS`; `RecordError` unless its digest is in `run.json`."""
         path = self.folder / name
-        content = path.read_bytes() if path.exists() else None
+        content = files.content(path) if path.exists() else None
         if content is None or hashlib.sha256(content).hexdigest() != self._digest(name):
             raise RecordError(f"{path}: {ALTERED}")
         return content

@@ -7,6 +7,7 @@ episodes within them, and does not estimate the time left, for which environment
 import fcntl
 import json
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +32,7 @@ class Planned(BaseModel):
     variant: str
     seed: int
     work: float  # relative duration among runs of its environment
-    due: bool
+    due: bool = False
 
 
 class Plan(BaseModel):
@@ -48,6 +49,20 @@ class Record(BaseModel):
 
     seconds: float
     start_seconds: float
+
+
+class Named(BaseModel):
+    """What is needed of a run's configuration."""
+
+    environment: str
+    variant: str
+    seed: int
+
+
+class Finished(Record):
+    """The same of a run of which no plan tells."""
+
+    config: Named
 
 
 class Told(Record):
@@ -113,18 +128,24 @@ def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
 
 
 def status(results: Path) -> list[str]:
-    """The lines of `mace-rl status`, about the runs that the workflow in `results` planned."""
-    path = results / files.PLAN
-    if not path.exists():
-        raise ConfigError(f"{results}: no workflow has begun here: no {files.PLAN}")
-    if (found := read(path, 0.0, Plan)) is None:
-        raise ConfigError(f"{path}: cut off or altered; the workflow's next start writes it anew")
-    plan = Plan(**found)
-    runs = [Run(run, results, path.stat().st_mtime) for run in plan.runs]
+    """The lines of `mace-rl status`: the runs that a workflow in `results` planned, or else all."""
+    path, cores = results / files.PLAN, None
+    if path.exists():
+        if (found := read(path, 0.0, Plan)) is None:
+            raise ConfigError(f"{path}: cut off or altered; the workflow's next start writes it")
+        plan = Plan(**found)
+        cores = plan.cores
+        began = path.stat().st_mtime
+        runs = [
+            Run(run, results / "runs" / run.env / run.variant / f"seed{run.seed}", began)
+            for run in plan.runs
+        ]
+    elif not (runs := [*unplanned(results)]):
+        raise ConfigError(f"{results}: no run in it or below it, and no {files.PLAN} of a workflow")
     states = Counter(run.state for run in runs)
     counts = [f"{states[state]} {state}" for state in ("running", "waiting", "stopped")]
     shown = [f"{states['done']} of {len(runs)} runs done", *(c for c in counts if c[:2] != "0 ")]
-    left, unknown = seconds_left(runs, plan.cores or states["running"])
+    left, unknown = seconds_left(runs, cores or states["running"])
     heading = ", ".join(shown)
     if states["running"]:
         heading += f"; about {duration(left)} left" if left else "; time left not known yet"
@@ -136,12 +157,11 @@ def status(results: Path) -> list[str]:
 
 
 class Run:
-    """One training run of a plan, as its folder shows it now."""
+    """One training run, as its folder shows it now; of a plan that was made when it `began`."""
 
-    def __init__(self, planned: Planned, results: Path, began: float) -> None:
+    def __init__(self, planned: Planned, folder: Path, began: float, name: str = "") -> None:
         self.env, self.variant, self.seed = planned.env, planned.variant, planned.seed
-        self.work = planned.work
-        folder = results / "runs" / self.env / self.variant / f"seed{self.seed}"
+        self.work, self.name = planned.work, name
         since = began if planned.due else 0.0  # older files are of an earlier attempt
         record = read(folder / files.RECORD, since, Record)
         told = read(folder / files.PROGRESS, since, Told)
@@ -167,7 +187,20 @@ class Run:
         shown = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
         shown |= cells(self.told) if self.told else {"episode": "starting"}
         shown |= {"left": "stopped"} if self.state == "stopped" else {}
-        return {"environment": self.env, "variant": self.variant, "seed": str(self.seed)} | shown
+        what = {"environment": self.env, "variant": self.variant, "seed": str(self.seed)}
+        return ({"folder": self.name} if self.name else {}) | what | shown
+
+
+def unplanned(results: Path) -> Iterator[Run]:
+    """The runs in and below a folder, finished or with progress to tell, in the folders' order."""
+    for folder in files.runs_below(results, [files.RECORD, files.PROGRESS]):
+        record = read(folder / files.RECORD, 0.0, Finished)
+        known = record["config"] if record else read(folder / files.PROGRESS, 0.0, Named)
+        if known is not None:
+            own = Planned(
+                env=known["environment"], variant=known["variant"], seed=known["seed"], work=1.0
+            )
+            yield Run(own, folder, 0.0, folder.relative_to(results).as_posix())
 
 
 def read(path: Path, since: float, model: type[BaseModel]) -> Any:
@@ -176,7 +209,7 @@ def read(path: Path, since: float, model: type[BaseModel]) -> Any:
     `ConfigError` if it has not what `model` has.
     """
     try:
-        content = json.loads(path.read_bytes()) if path.stat().st_mtime >= since else None
+        content = json.loads(files.content(path)) if path.stat().st_mtime >= since else None
     except (FileNotFoundError, ValueError):  # the latter also of what is no text
         return None
     if content is not None:
@@ -187,7 +220,7 @@ def read(path: Path, since: float, model: type[BaseModel]) -> Any:
 def held(lock: Path) -> bool:
     """Whether a process, on any machine, has locked this file."""
     try:
-        with lock.open("rb") as file:
+        with open(lock, "rb", opener=lambda name, how: os.open(name, how | os.O_NONBLOCK)) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True

@@ -17,6 +17,7 @@ from mace_rl import sources
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check, short_repr
+from mace_rl.files import content
 from mace_rl.refusal import Refusal
 
 # The packages whose version can change a result.
@@ -84,7 +85,7 @@ def difference(found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") 
 
 def file_digest(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(content(path)).hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -143,7 +144,7 @@ def machine() -> dict[str, Any]:
 def read_record(path: Path) -> dict[str, Any]:
     """A `run.json`; `ProvenanceError` if there is none, `ConfigError` if it lacks something."""
     try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        record: dict[str, Any] = json.loads(content(path))
     except (FileNotFoundError, NotADirectoryError):
         raise ProvenanceError(f"no finished run in {path.parent}: it has no {path.name}") from None
     except (OSError, ValueError, RecursionError) as error:

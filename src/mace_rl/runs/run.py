@@ -18,8 +18,9 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from mace_rl import files
-from mace_rl.config.run import RunConfig
+from mace_rl.config.run import IDENTITY, RunConfig
 from mace_rl.environments import resuming
+from mace_rl.environments.resuming import seeded
 from mace_rl.environments.rollout import fallback_reason
 from mace_rl.files import write_atomically
 from mace_rl.published import PublishedTrainer
@@ -28,15 +29,17 @@ from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.finished import WAY_OUT, finished, otherwise
+from mace_rl.streams import Streams
 from mace_rl.trainer import Trainer
 
 logger = logging.getLogger(__name__)
 
-PROGRESS_SECONDS, OBSERVER_SECONDS = 2.0, 0.5
+PROGRESS_SECONDS = 2.0
 START_SHARE = 0.01  # of the episodes: these wait for their code to be compiled
 # Between checkpoints are this time, and as much as keeps their cost under 1 %.
 CHECKPOINT_SECONDS, CHECKPOINT_VARIABLE = 10.0, "MACE_RL_CHECKPOINT_SECONDS"
 CHECKPOINT_COST = 0.01
+FIRST_CHECKPOINT_SECONDS = 2.0  # after the start, or as soon as what that compiles has run
 LOCK_SECONDS = 5.0  # for which a run waits until one whose Snakemake was killed has ended
 CLAIM = b"mace-rl trains here\n"  # in the lock file: the files of a run beside it are ours
 
@@ -55,7 +58,7 @@ def run(
 ) -> None:
     """Train as `config` says, on one thread, and leave the results in `directory`.
 
-    observe: is told `how_far` the run is, else a file in `directory` is.
+    observe: is told `how_far` the run is, as a file in `directory` is.
     keep_checkpoint: keep a last one, from which deleted results come back without training.
     after_episode: is called with each episode after the update on it.
     aside: what is moved into a folder below `directory`: files of "others" than this run, or "all".
@@ -64,8 +67,10 @@ def run(
     finished. Raises `RunError` if another process trains in `directory` or other files are in the
     way, `ConfigError` if another finished run is.
     """
+    directory = directory.absolute()  # an environment may change the current folder
     directory.mkdir(parents=True, exist_ok=True)
-    with exclusive(directory) as lock, threadpool_limits(1), single_threaded():
+    own = seeded(Streams(config.seed).sequence("global"))
+    with exclusive(directory) as lock, threadpool_limits(1), single_threaded(), own:
         if aside == "nothing" and finished(config, directory):
             if (directory / files.CHECKPOINT).exists():  # of a run killed at its end
                 (directory / files.CHECKPOINT).unlink()
@@ -78,12 +83,11 @@ def run(
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # the collector need not look again at what stays
-        clock = Clock(started, OBSERVER_SECONDS if observe else PROGRESS_SECONDS)
+        clock = Clock(started)
         if state is not None:
             resume(trainer, clock, state)
         checkpoint.require_plain(trainer.state_dict(), "state")  # now rather than after minutes
         told = directory / files.PROGRESS
-        observe = observe or (lambda progress: write_atomically(told, json.dumps(progress)))
 
         def save() -> None:
             with clock.saving():
@@ -97,8 +101,11 @@ def run(
             if not clock.start_seconds or len(trainer.records) <= START_SHARE * config.episodes:
                 clock.start_seconds = time.monotonic() - started
             if time.monotonic() >= clock.next_progress:
-                clock.next_progress = time.monotonic() + clock.progress_seconds
-                observe(how_far(trainer, clock))
+                clock.next_progress = time.monotonic() + PROGRESS_SECONDS
+                progress = how_far(trainer, clock)
+                write_atomically(told, json.dumps(progress))
+                if observe:
+                    observe(progress)
             if clock.checkpoint_due():
                 save()
         if keep_checkpoint:
@@ -141,6 +148,8 @@ def to_continue(
         for name in files.OF_A_RUN:
             for half_written in directory.glob(f".{name}.[0-9]*.tmp"):  # by a killed process
                 half_written.unlink()
+    if trained_here and not content and files.RECORD not in there:
+        logger.info("starting over: what was trained in %s left no checkpoint", directory)
     if not os.fstat(lock).st_size:
         os.write(lock, CLAIM)
     return content["state"] if content else None
@@ -170,13 +179,13 @@ def resume(trainer: Trainer, clock: "Clock", state: dict[str, Any]) -> None:
 class Clock:
     """Training time, and when progress and checkpoints are due; seconds."""
 
-    def __init__(self, start: float, progress_seconds: float) -> None:
+    def __init__(self, start: float) -> None:
         self.start = start  # by `time.monotonic`, as if there had been no interruption
         self.start_seconds = 0.0  # from the start of this process to the end of its first episodes
-        self.progress_seconds = progress_seconds
         self.next_progress = time.monotonic()
         self.between_checkpoints = between_checkpoints()
-        self.next_checkpoint = time.monotonic() + self.between_checkpoints
+        soon = min(FIRST_CHECKPOINT_SECONDS, self.between_checkpoints)
+        self.next_checkpoint = time.monotonic() + soon
         self.checkpoint_seconds = 0.0  # spent on checkpoints
         self.interruptions: list[dict[str, Any]] = []
 
@@ -238,7 +247,10 @@ def single_threaded() -> Iterator[None]:
 def exclusive(directory: Path) -> Iterator[int]:
     """Lock the run's folder for this process; gives the lock file's descriptor."""
     # By a file: two machines can lock the same folder on a network's disk.
-    with open(directory / files.LOCK, "a+b") as file:
+    path = directory / files.LOCK
+    if path.exists() and not path.is_file():
+        raise RunError(f"{path}: it is no ordinary file")
+    with open(path, "a+b") as file:
         # A copy in an environment's worker would hold the lock after the training.
         os.register_at_fork(after_in_child=file.close)
         patience = time.monotonic() + LOCK_SECONDS
@@ -261,6 +273,7 @@ def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
     speed = last.env_steps / max(1e-9, seconds - clock.start_seconds)
     steps_left = (episodes - len(records)) * fmean(record.length for record in recent)
     return {
+        **{key: getattr(trainer.config, key) for key in IDENTITY},
         "episode": len(records),
         "episodes": episodes,
         "recent_return": fmean(record.extrinsic_return for record in recent),

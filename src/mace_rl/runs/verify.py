@@ -55,7 +55,7 @@ def verify(folder: Path, sample: int | None, trust: bool = False) -> Iterator[st
 
     Raises `NotReproducedError` at the end, and what the parts of a `FinishedRun` raise.
     """
-    runs = FinishedRun.below(folder, trust)
+    runs = FinishedRun.below(folder.absolute(), trust)  # environments may change the folder
     if sample is not None and sample < len(runs):
         chosen = np.random.default_rng(0).choice(len(runs), sample, replace=False)
         runs = [runs[i] for i in sorted(chosen)]

@@ -10,11 +10,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
+from mace_rl.environments.resuming import seeded
 from mace_rl.environments.rollout import draw_noise, roll_out
 from mace_rl.runs.agent import Player
 from mace_rl.runs.finished import FinishedRun
@@ -110,7 +110,7 @@ def film(
 
     Raises what `load_agent` raises, and `RenderError` if the environment cannot be drawn.
     """
-    run = FinishedRun(directory, trust)
+    run = FinishedRun(directory.absolute(), trust)
     config = run.agent_config
     player = Player(config) if untrained else Player.of(run)
     environment, policy = player.environment, player.acting(deterministic)
@@ -123,15 +123,16 @@ def film(
         )
     drawn = {**config.environment_arguments, "render_mode": "rgb_array"}
     seeds, limit = np.random.SeedSequence(0), config.max_episode_steps
+    globally = np.random.SeedSequence(seed)
     try:
-        environment = Environment(config.environment, seeds, limit, drawn)
+        with seeded(globally):
+            environment = Environment(config.environment, seeds, limit, drawn)
     except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
     environment.clips_actions = config.ppo.clip_actions
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
-    with closing(filmed), nothing_printed(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with closing(filmed), nothing_printed(), seeded(globally):
         filmed.env.reset(seed=seed)  # as `evaluate` does; no picture of it
         for _ in range(episodes):
             roll_out(environment, policy, draw_noise(environment, generator))

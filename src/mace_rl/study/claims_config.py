@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
+from mace_rl.study.labels import require_latex
 from mace_rl.study.measure.betas import CORRELATIONS
 from mace_rl.study.measure.metrics import METRICS, all_metrics
 from mace_rl.study.metrics_config import MetricsConfig, Names, once
@@ -26,6 +27,9 @@ class Part(NamedTuple):
     variant: str
     baseline: str | None  # None: over 0
     in_paper: float  # variant - baseline in the paper's Table 1; NaN where that has none
+
+
+FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 
 
 class ReportConfig(Section):
@@ -176,6 +180,11 @@ def parts_of(family: FamilyConfig) -> list[tuple[str, PartsConfig]]:
     ]
 
 
+def too_few(seeds: int) -> str:
+    """Why nothing is decided with so many."""
+    return f"that takes {FEWEST_SEEDS} seeds, and there are {seeds}"
+
+
 def parse_claims(path: str | Path) -> ClaimsConfig:
     """The file at `path`, whatever study it is for; a `ConfigError` with its first mistake."""
     return check(ClaimsConfig, read_yaml(Path(path)), str(path))
@@ -187,6 +196,9 @@ def read_claims(study: "Study", path: str | Path) -> ClaimsConfig:
     try:
         _check_names(claims, study)
         _check_form(claims)
+        require_latex(claims.table1.caption, "table1.caption")
+        for name in claims.table2.rows.values():
+            require_latex(name, "table2.rows")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return claims

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 from pydantic import AfterValidator, Field, ValidationError
 
 from mace_rl.config.beta import MetaConfig
@@ -24,13 +25,15 @@ from mace_rl.config.reading import Settings, merge, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, check_known, explain, short_repr
 from mace_rl.environments import registered
+from mace_rl.study.labels import require_latex
 from mace_rl.study.metrics_config import GOALS, FigureConfig, MetricsConfig, Names, once
 
 # Environments and variants name folders and appear in Snakemake's patterns. An environment may have
 # more, as in Gymnasium: package.module:Namespace/Id.
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 # What the figures' font has; Matplotlib leaves out of legends what begins with '_'.
-LABEL = r"(?![_ ])[ -\u02af\u0370-\u037e\u0384-\u0525\u2010-\u20b5\u2190-\u22ff]{1,60}(?<! )"
+LETTERS, SIGNS = r" -\u02af\u0370-\u037e\u0384-\u045f\u0490\u0491", r"\u2010-\u20b5\u2190-\u22ff"
+LABEL = rf"(?![_ ])[{LETTERS}{SIGNS}]{{1,60}}(?<! )"
 
 
 class LeftOut(Section):
@@ -158,6 +161,7 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
             check_known(variant, study.variant_settings, "variants", "variant_settings")
         for variant, shown in study.variant_settings.items():
             _check_name(variant, "variant_settings")
+            require_latex(shown.label or "", f"variant_settings.{variant}.label")
             if shown.colour is not None and not is_color_like(shown.colour):
                 raise ConfigError(
                     f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"
@@ -241,8 +245,7 @@ def _resolve(study: Study, environment: str, variant: str, changes: Settings) ->
             )
     left_out = {name: settings[name] for name in unused if changes.get(name) is not None}
     check(LeftOut, left_out, "in the changes")
-    _check_environment(config)
-    return config
+    return _with_time_limit(config, _registered(config))
 
 
 def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
@@ -272,8 +275,8 @@ def _check_name(environment: str, key: str) -> None:
         )
 
 
-def _check_environment(config: RunConfig) -> None:
-    """Refuse an environment that cannot be made with these settings, without making it."""
+def _registered(config: RunConfig) -> EnvSpec:
+    """Its environment in Gymnasium's registry; `ConfigError` if that cannot be made."""
     name, key = config.environment, "environment"
     if ":" in name:
         import_module(name, key)  # which registers it
@@ -287,12 +290,6 @@ def _check_environment(config: RunConfig) -> None:
         hint = "" if ":" in name else f" (if a module registers it: module:{name})"
         check_known(own, registered(), key, f"Gymnasium's registry{hint}")
     spec = registered()[own]
-    if (config.max_episode_steps or spec.max_episode_steps) is None:
-        raise ConfigError(
-            f"{key} has {name!r}, which has no time limit of its own, so that its episodes need "
-            f"not end: --max-episode-steps or environment_settings.{name}.max_episode_steps should "
-            "set one"
-        )
     if isinstance(spec.entry_point, str):
         try:  # imports the packages around the environment's module, not that module
             importlib.util.find_spec(spec.entry_point.partition(":")[0])
@@ -301,3 +298,24 @@ def _check_environment(config: RunConfig) -> None:
             raise ConfigError(
                 f"{key} has {name!r}, but the package it needs should be installed: {reason}"
             ) from None
+    return spec
+
+
+def _with_time_limit(config: RunConfig, spec: EnvSpec) -> RunConfig:
+    """Also where only the environment itself has one, `max_steps`, as MiniGrid's do."""
+    if config.max_episode_steps or spec.max_episode_steps:
+        return config
+    from mace_rl.environments.environment import trying_out  # numba takes a second
+
+    name = config.environment
+    with trying_out(f"environment {name!r}"):
+        env = gymnasium.make(spec, disable_env_checker=True, **config.environment_arguments)
+        limit = getattr(env.unwrapped, "max_steps", None)
+        env.close()
+    if not isinstance(limit, int):
+        raise ConfigError(
+            f"environment has {name!r}, which has no time limit of its own, so that its episodes "
+            f"need not end: --max-episode-steps or environment_settings.{name}.max_episode_steps "
+            "should set one"
+        )
+    return config.model_copy(update={"max_episode_steps": limit})

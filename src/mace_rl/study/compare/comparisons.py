@@ -38,8 +38,9 @@ class Comparison(NamedTuple):
 def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of comparisons.csv from the frame of metrics.csv.
 
-    One `Comparison` per environment, metric and configured pair of variants that are both there;
-    then one per metric and pair for all environments together, if there are several.
+    One `Comparison` per environment, metric that is compared and configured pair of variants that
+    are both there; then one per metric and pair for all environments together, if there are
+    several.
     """
     variants = set(table["variant"])
     pairs = [pair for pair in settings.comparisons if variants.issuperset(pair)]
@@ -68,7 +69,7 @@ def _compare(
     All runs are censored at the same episode E. Restricted to E, the mean ∫₀ᴱ S(t) dt of Kaplan's
     and Meier's estimate S is then the mean of the runs, with E for those that never got there.
     """
-    (variant, baseline), metrics = pair, all_metrics(settings)
+    (variant, baseline), metrics = pair, [one for one in all_metrics(settings) if one.compared]
     how = (settings.confidence, settings.bootstrap_repetitions)
     seed = settings.bootstrap_seed  # of a generator for each: no row depends on another
     signs = [-1 if metric.unit == "episodes" else 1 for metric in metrics]  # greater is better

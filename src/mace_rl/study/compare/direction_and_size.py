@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from mace_rl.study.claims_config import Part
+from mace_rl.study.claims_config import FEWEST_SEEDS, Part
 from mace_rl.study.compare import estimates
 from mace_rl.study.compare.estimates import LEVEL, Pair, find, pairs_of
 from mace_rl.study.compare.ledger import SizedFinding
@@ -30,7 +30,7 @@ def find_sized(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Size
 
 def decided(part: SizedFinding) -> SizedFinding:
     """A part whose p values are corrected, with what the rule says of it."""
-    if part.seeds < estimates.FEWEST_SEEDS:
+    if part.seeds < FEWEST_SEEDS:
         return replace(part, outcome="open", size="open")
     size = "small" if max(-part.low, part.high) < part.worth_mentioning else "open"
     if max(part.low, -part.high) > part.worth_mentioning:

@@ -21,7 +21,6 @@ from mace_rl.study.metrics_config import MetricsConfig
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
 WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
-FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
 

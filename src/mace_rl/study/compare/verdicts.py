@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mace_rl.study.claims_config import ClaimConfig, ClaimsConfig, Part, Table1Config
+from mace_rl.study.claims_config import FEWEST_SEEDS, ClaimConfig, ClaimsConfig, Part, Table1Config
 from mace_rl.study.compare import direction_and_size
-from mace_rl.study.compare.estimates import FEWEST_SEEDS, LEVEL, WORTH_MENTIONING, find, pairs_of
+from mace_rl.study.compare.estimates import LEVEL, WORTH_MENTIONING, find, pairs_of
 from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import holm
 from mace_rl.study.measure.metrics import metric_units

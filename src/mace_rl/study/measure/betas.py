@@ -18,6 +18,13 @@ if TYPE_CHECKING:  # planning the workflow imports this module
 CORRELATION = "stagnation_correlation"
 BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
 CORRELATIONS = CORRELATION, BEFORE, AFTER
+LABELS = {  # of columns, in tables
+    "beta_end": "β at the end",
+    "beta_lowest": "lowest β",
+    CORRELATION: "with stagnation",
+    BEFORE: "before the common bar",
+    AFTER: "after it",
+}
 
 
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:

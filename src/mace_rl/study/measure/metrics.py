@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # planning the workflow imports this module, without pandas
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
+PUBLIC_CODE_LAST = 10  # [R] episodes whose mean sets the bar of sample efficiency
 
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
@@ -88,6 +89,8 @@ class Metric:
     unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
     function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
     needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
+    # In comparisons.csv, where each metric makes the correction stricter.
+    compared: bool = field(default=True, kw_only=True)
     # Of the moving average's window and E, the first episode that it can be.
     earliest: Callable[[int, int], int] = field(default=lambda window, _: 1, kw_only=True)
 
@@ -181,6 +184,15 @@ def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     return curve.first(flat, first)
 
 
+def sample_efficiency_public_code(curve: LearningCurve) -> Attained:
+    """The rule of the authors' public code: the paper's, whose bar is of the last 10 episodes.
+
+    It asks no more of a run: one that has learned nothing may reach its bar in episode 1.
+    """
+    bar = curve.settings.threshold * np.mean(curve.returns[-PUBLIC_CODE_LAST:])
+    return curve.first(curve.returns >= bar)
+
+
 def sample_efficiency_common(curve: LearningCurve) -> Attained:
     """The first episode whose moving average has come threshold of the way to the reference.
 
@@ -247,6 +259,10 @@ METRICS = (  # the area is under the learning curve, per episode
     replace(
         _episodes(convergence_steps_public_code, "Convergence (public code)", 0),
         earliest=_public_code_first,
+    ),
+    replace(
+        _episodes(sample_efficiency_public_code, "Sample efficiency (public code)", 0),
+        compared=False,
     ),
 )
 

@@ -26,6 +26,7 @@ DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 LETTERS = 140  # about as many as stand side by side in a legend
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
+INSET = (0.4, 0.14, 0.58, 0.56)  # left, bottom, width and height, in the panel
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
 HIDDEN = 0.01  # of what all means span: lines so near to each other are one to the eye
 _TICKS = {"size": 3, "width": 0.8}  # points
@@ -157,8 +158,8 @@ def draw_figure(
                 if seeds[variant] > 1:  # else its line is the mean's
                     axes.plot(run["episode"], run[shown.name], **faint)
             share = look.layout.inset
-            if share and shown.limits is None and _is_early(own, share):
-                inset = axes.inset_axes((0.4, 0.14, 0.58, 0.56))
+            if share and shown.limits is None and _is_early(own, share) and _is_free(axes, own):
+                inset = axes.inset_axes(INSET)
                 draw_means(inset, own[own["episode"] <= share * own["episode"].max()], look)
                 inset.set_xlim(0, share * own["episode"].max())
                 inset.locator_params(nbins=3)
@@ -248,6 +249,17 @@ def _is_early(curves: pd.DataFrame, share: float) -> bool:
     means = curves.groupby("variant")["mean"]
     risen = early.groupby("variant")["mean"].max() - means.min()
     return bool((risen > MOSTLY * (means.max() - means.min())).all())
+
+
+def _is_free(axes: Axes, curves: pd.DataFrame) -> bool:
+    """Whether no mean and no band of one goes where the inset would be."""
+    across, up, width, height = INSET
+    to_axes = axes.transData + axes.transAxes.inverted()
+    for column in ("mean", "lower", "upper"):
+        x, y = to_axes.transform(curves[["episode", column]].dropna()).T
+        if ((x > across) & (x < across + width) & (y > up) & (y < up + height)).any():
+            return False
+    return True
 
 
 def draw_means(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:

@@ -1,6 +1,5 @@
 """The paper's Table 1 and Table 2 as LaTeX to \\input: captions, tabulars and cells."""
 
-import unicodedata
 from collections.abc import Mapping
 
 import pandas as pd
@@ -9,38 +8,12 @@ from mace_rl.config.agent import PPOConfig
 from mace_rl.study.claims_config import Table1Config, Table2Config
 from mace_rl.study.compare.statistics import BOOTSTRAP_SEEDS, interval_kind
 from mace_rl.study.compare.summary import from_to
+from mace_rl.study.labels import escaped, packages
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
 from mace_rl.study.show.tables import COLUMNS_PER_BLOCK, DASH, Cell
 
 INTERVALS = {"t": "$t$", "bootstrap": "bootstrap"}  # by `interval_kind`
-
-_NAMED = (  # what LaTeX calls them; Greek letters without a name there look Latin
-    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau"
-    " upsilon phi chi psi omega Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega"
-)
-_LIKE_LATIN = {"Alpha": "A", "Beta": "B", "Epsilon": "E", "Zeta": "Z", "Eta": "H", "Iota": "I"}
-_LIKE_LATIN |= {"Kappa": "K", "Mu": "M", "Nu": "N", "Omicron": "O", "Rho": "P", "Tau": "T"}
-_LIKE_LATIN |= {"Chi": "X", "omicron": "o"}
-
-
-def _greek(name: str) -> str:
-    """The letter that LaTeX calls so."""
-    size = "CAPITAL" if name[0].isupper() else "SMALL"
-    return unicodedata.lookup(f"GREEK {size} LETTER {name.replace('mbda', 'mda').upper()}")
-
-
-_GREEK = {_greek(name): rf"$\{name}$" for name in _NAMED.split()}
-_GREEK |= {_greek(name): latin for name, latin in _LIKE_LATIN.items()}
-_LATEX = str.maketrans(  # escapes stand for letters that look like Latin ones
-    {character: f"\\{character}" for character in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    | {"<": "$<$", ">": "$>$", "|": "$|$", "±": r"$\pm$", "\u00d7": r"$\times$", "−": "$-$"}
-    | {"\u2013": "--", "\u2014": "---", "₀": "$_0$", "≤": r"$\leq$", "≥": r"$\geq$"}
-    | _GREEK
-    | {"ϵ": r"$\epsilon$", "ς": r"$\varsigma$", "\U0001d43e": "$K$", "⁻": "$^-$"}
-    | {power: f"$^{digit}$" for digit, power in enumerate("⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹")}
-)
 
 
 def table1_latex(
@@ -68,7 +41,7 @@ def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
     columns = r"tabular}{@{}p{0.42\linewidth}l@{}"
     body = [*rows[:end], r"\midrule", *rows[end:]]
     lines = _lines(columns, r"Hyperparameter & Value \\", *body)
-    return _float("table", what, "tab:table2", *lines)
+    return _float("table", packages(""), what, "tab:table2", *lines)
 
 
 def _how(table: pd.DataFrame, confidence: float) -> str:
@@ -93,26 +66,19 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     return text
 
 
-def escaped(text: str) -> str:
-    """`text` with LaTeX's special characters escaped and symbols such as β in math mode."""
-    return text.translate(_LATEX)
-
-
 def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
-    """A table for \\input, as wide as the page.
-
-    It needs the package booktabs and, if a label has letters that LaTeX's own fonts have not,
-    such as Cyrillic ones, the package fontenc.
-    """
+    """A table for \\input, as wide as the page; its first line says what the preamble needs."""
     head, *names = frame.columns
     starts = range(0, len(names), COLUMNS_PER_BLOCK)
     blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
     tabulars = "\n\\par\\medskip\n".join(_tabular(frame[[head, *block]]) for block in blocks)
-    return _float("table*", caption, label, r"\setlength{\tabcolsep}{2pt}", tabulars)
+    needs = packages(" ".join([*frame[head], *names]))
+    return _float("table*", needs, caption, label, r"\setlength{\tabcolsep}{2pt}", tabulars)
 
 
-def _float(kind: str, caption: str, label: str, *body: str) -> str:
-    lines = [rf"\begin{{{kind}}}[tbp]", r"\centering", rf"\caption{{{caption}}}"]
+def _float(kind: str, needs: list[str], caption: str, label: str, *body: str) -> str:
+    lines = [f"% Needs {' '.join(needs)}"]
+    lines += [rf"\begin{{{kind}}}[tbp]", r"\centering", rf"\caption{{{caption}}}"]
     lines += [rf"\label{{{label}}}", r"\par\medskip", r"\footnotesize", *body]
     return "\n".join([*lines, rf"\end{{{kind}}}"]) + "\n"
 

@@ -19,8 +19,7 @@ from matplotlib.colors import to_hex
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.runs.progress import duration
-from mace_rl.study.claims_config import ClaimsConfig
-from mace_rl.study.compare.estimates import FEWEST_SEEDS
+from mace_rl.study.claims_config import FEWEST_SEEDS, ClaimsConfig
 from mace_rl.study.compare.ledger import Answer
 from mace_rl.study.compare.summary import from_to
 from mace_rl.study.measure.metrics import metric_labels

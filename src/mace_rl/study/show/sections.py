@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from mace_rl.records import read_table
-from mace_rl.study.claims_config import ClaimsConfig
+from mace_rl.study.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
 from mace_rl.study.compare.comparisons import ALL
 from mace_rl.study.compare.estimates import POWER
 from mace_rl.study.compare.ledger import Answer, read_ledger
 from mace_rl.study.compare.summary import from_to
-from mace_rl.study.measure.betas import betas_columns
+from mace_rl.study.measure.betas import CORRELATIONS, LABELS, betas_columns
 from mace_rl.study.measure.metrics import read_metrics
 from mace_rl.study.metrics_config import MetricsConfig
 from mace_rl.study.show import tables
@@ -78,6 +78,10 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
         verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
         page = "metrics" if claims.rule == 2 else "protocol"
         note = f"Of {len(own)}, {verdicts}. The rule: docs/{page}.md."
+        ways = [way for answer in own for way in answer.ways.values()]
+        seeds = min(part.seeds for way in ways for part in way.parts)
+        if seeds < FEWEST_SEEDS:
+            note += f" No claim can have a verdict: {too_few(seeds)}."
         yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
@@ -89,7 +93,13 @@ def of_runs(
 ) -> list[Section]:
     """Everything but the ledger, with these names of the variants."""
     data = {name: tables.named(frame, names) for name, frame in data.items()}
-    found = [*_means(data, claims, settings), *_compared(data, settings), *_others(data, settings)]
+    asked = [
+        (key.partition(".")[0], one.metric)
+        for own in claims.families.values()
+        for key, one in parts_of(own)
+    ]
+    found = [*_means(data, claims, settings), *_compared(data, settings)]
+    found += _others(data, settings, asked)
     note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
     for environment, frame in tables.companions(data["supplement"], settings).items():
         found.append(Section(f"The other metrics: {environment}", note, frame))
@@ -134,8 +144,10 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
         yield Section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
 
 
-def _others(data: Data, settings: MetricsConfig) -> Iterator[Section]:
-    """All environments together, readings and β."""
+def _others(
+    data: Data, settings: MetricsConfig, asked: Sequence[tuple[str, str]]
+) -> Iterator[Section]:
+    """All environments together, readings and β; asked: claims with metrics that they compare."""
     if data["metrics"]["env"].nunique() > 1:
         note = "Scores: 0 is the random policy, 1 the study's best run."
         yield Section("All environments together", note, tables.aggregate(data["aggregate"]))
@@ -151,6 +163,9 @@ def _others(data: Data, settings: MetricsConfig) -> Iterator[Section]:
         note = (
             "Where β is not the same in every seed: of all seeds the least, the median and the"
             " most. With stagnation: mean over seeds of its rank correlation with the stagnation"
-            " before (C9)."
+            " of the episodes before, in all of training, and before and after the common bar."
         )
+        for name in [name for name in CORRELATIONS if name in data["betas"]]:
+            if judged := dict.fromkeys(claim for claim, metric in asked if metric == name):
+                note += f" Of {', '.join(judged)} it is the column *{LABELS[name]}*."
         yield Section("β", note, frame)

@@ -14,6 +14,7 @@ from mace_rl.study.compare.ledger import Answer, SizedFinding
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
+from mace_rl.study.measure.betas import CORRELATIONS, LABELS
 from mace_rl.study.measure.metrics import metric_labels, metric_units
 from mace_rl.study.metrics_config import MetricsConfig
 
@@ -177,19 +178,20 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
 def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """betas.csv: the variants whose β is not the same in every seed, and how it ended."""
-    rows = []
+    rows: list[dict[str, str | Cell]] = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
         if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
             continue
-        found = runs["stagnation_correlation"].to_numpy()
-        correlation = Cell([estimate((found.mean(), *map(float, interval(found, settings))), 3)])
-        seeds = (
-            ", ".join(number(beta, 2) for beta in runs[name].quantile([0, 0.5, 1]))
-            for name in ("beta_end", "beta_lowest")
-        )
-        rows.append([environment, variant, _number(len(runs)), *seeds, correlation])
-    heads = ["environment", "", "n", "β at the end", "lowest β", "with stagnation"]
-    return pd.DataFrame(rows, columns=heads)
+        rows.append({"environment": str(environment), "": str(variant), "n": _number(len(runs))})
+        for name in runs.columns.intersection(list(LABELS), sort=False):
+            found = runs[name].to_numpy()
+            if name in CORRELATIONS:
+                ends = map(float, interval(found, settings))
+                shown: str | Cell = Cell([estimate((found.mean(), *ends), 3)])
+            else:
+                shown = ", ".join(number(beta, 2) for beta in np.quantile(found, [0, 0.5, 1]))
+            rows[-1][LABELS[name]] = shown
+    return pd.DataFrame(rows)
 
 
 def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
