@@ -253,13 +253,13 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
         (
             {"observation_space": Tuple([Dict(a=Text(3))])},
             10,
-            r"observation\[0\]\['a'\] is of Text",
+            r"\[0\]\['a'\] is of Text",
         ),
         ({"observation_space": Tuple([Dict(a=Discrete(10**9))])}, 10, "has 1000000000 numbers"),
         (
             {"observation_space": Tuple([Dict(a=Dict({}))])},
             10,
-            r"observation\[0\]\['a'\] is of Dict",
+            r"\[0\]\['a'\] is of Dict",
         ),
         (None, 10, ""),
     ],

@@ -133,6 +133,37 @@ def test_time_stamps_do_not_count(finished: Project) -> None:
     assert output.endswith(finished["file.log"].read_text().partition("Table 1")[2])
 
 
+MODES = {  # options, with a file taken away before, and what the last lines then have
+    "--touch": ("table1.csv", "Not there, and not made now: results/table1.csv"),
+    "--until train": (f"{RUNS[0]}/agent.pt", "Not there, and not made now: results/runs/"),
+    "--until metrics": (f"{RUNS[0]}/agent.pt", "results/betas.csv, results/metrics.csv"),
+    "--omit-from figure": ("figure1.pdf", "results/table1.tex, results/table2.tex"),
+    "--rerun-triggers mtime": (None, "results/figure1.pdf, results/figure2.pdf"),
+    "--batch all=1/2": (None, "results/table1.tex"),
+    "--summary": (None, "no update"),
+    "--list-changes params": (None, "Building DAG"),
+    "--delete-all-output --dry-run": (None, "Would delete results/"),
+    "--report r.html": (None, "Report created"),
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_last_lines_are_true_in_each_of_snakemake_s_modes(finished: Project, mode) -> None:
+    name, said = MODES[mode]
+    away = finished[f"results/{name}"] if name else None
+    if away:
+        away.rename(away.with_suffix(".away"))
+    try:
+        code, output = finished(f"snakemake -j2 all {mode}")
+    finally:
+        if away:
+            away.with_suffix(".away").rename(away)
+    assert code == 0 and said in output and "Traceback" not in output and "File " not in output
+    last = output.partition("Table 1: ")[2] or output[output.rfind("Complete log") :]
+    for path in re.findall(r"results/\S+\.\w+(?=,|\n)", last.partition("Not there")[0]):
+        assert finished[path].exists() and path != f"results/{name}"
+
+
 TRAIN = {"train": 6, **EVALUATION}
 CONFIG = "config.yaml"
 CHANGES = [  # of a file, from one text to another, and what is to be done then

@@ -84,7 +84,7 @@ class CuriosityTracker(Stateful):
         return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
 
     def begin(self, environment: int, observation: Any, afresh: bool = False) -> None:
-        """Start an episode; one that is not over ends here, or is forgotten if all begins afresh."""
+        """Start an episode; one that is not over ends here, or, if all is afresh, is forgotten."""
         unfinished = self.recordings[environment]
         if unfinished is not None and unfinished.rewards and not afresh:
             self.end(environment, terminated=False)
