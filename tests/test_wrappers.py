@@ -57,11 +57,13 @@ class ByEpisodes:
         novelty = NoveltyConfig(**defaults()["novelty"] | SMALL["novelty"])
         self.curiosity = Curiosity(memory, novelty, space, size, Streams(seed))
         self.sums = [[], []]  # discounted, of extrinsic rewards and of bonuses
+        self.bonuses = []
 
-    def pay(self, episode: Episode) -> tuple[float, float, np.ndarray]:
-        """β, the unit, and the bonus with its factors, [T, 3]; then the episode is remembered."""
+    def pay(self, episode: Episode) -> tuple[float, float, float, np.ndarray]:
+        """β, unit, mean, and the bonus with its factors, [T, 3]; then it is remembered."""
         bonus = self.curiosity.bonus(episode)
-        beta, unit = self.beta.beta, 0.0
+        beta, unit, usual = self.beta.beta, 0.0, np.mean(self.bonuses or [0.0])
+        self.bonuses += bonus.reward.tolist()
         if self.sums[0]:
             extrinsic, intrinsic = (np.std(sums) for sums in self.sums)
             unit = max(extrinsic, 1.0) / intrinsic
@@ -72,7 +74,7 @@ class ByEpisodes:
         returns = [sum(0.99 ** (k - t) * episode.rewards[k] for k in ahead[t:]) for t in ahead]
         self.curiosity.remember(episode, np.array(returns))
         self.beta.next_episode(episode, bonus.reward)
-        return beta, unit, np.stack(bonus[:3], axis=1)
+        return beta, unit, usual, np.stack(bonus[:3], axis=1)
 
 
 @pytest.mark.parametrize(
@@ -100,13 +102,13 @@ def test_pays_what_the_trainer_s_curiosity_gives_for_whole_episodes(name, beta):
         unknown = np.zeros(length, np.float32)
         vectors = np.float32([flatten(space, state) for state in states])
         episode = Episode(vectors, unknown, unknown, np.array(rewards), terminated)
-        beta_now, unit, bonus = expected.pay(episode)
+        beta_now, unit, usual, bonus = expected.pay(episode)
         for t, (_, total, *_, info) in enumerate(paid[number + 1 - length : number + 1]):
             assert info["reward_extrinsic"] == rewards[t] and info["beta"] == beta_now
             found = [info[part] for part in ("curiosity", "novelty", "relevance")]
             np.testing.assert_allclose(found, bonus[t], rtol=1e-4, atol=1e-5)
-            added = beta_now * unit * info["curiosity"]
-            assert info["reward_curiosity"] == pytest.approx(added, rel=1e-4, abs=1e-12)
+            added = beta_now * unit * (info["curiosity"] - usual)
+            assert info["reward_curiosity"] == pytest.approx(added, rel=1e-3, abs=1e-5)
             assert total == info["reward_extrinsic"] + info["reward_curiosity"]
         states, rewards, episodes = [bare.reset()[0]], [], episodes + 1
     assert episodes >= 3

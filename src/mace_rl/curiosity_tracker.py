@@ -20,6 +20,7 @@ from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.factories import beta_rule
+from mace_rl.numerics.arrays import total
 from mace_rl.numerics.finite import require_within
 from mace_rl.records import LARGEST_BETA
 from mace_rl.state import Stateful
@@ -35,6 +36,7 @@ class Recording:
 
     beta: float
     unit: float  # see `CuriosityTracker.unit`
+    usual: float  # R_curiosity that is paid with 0
     visits: np.ndarray  # to each Discrete state so far, [observation]; 0 for Box ones
     observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
@@ -54,14 +56,14 @@ class Recording:
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
         """From the tensors of `state_dict` as arrays."""
-        beta, unit, visits, *lists = state.values()
-        return cls(beta.item(), unit.item(), visits, *map(list, lists))
+        beta, unit, usual, visits, *lists = state.values()
+        return cls(beta.item(), unit.item(), usual.item(), visits, *map(list, lists))
 
 
 class CuriosityTracker(Stateful):
     """The curiosity bonus for unfinished episodes of several environments."""
 
-    STATE = ("curiosity", "controller", "scales", "recordings", "steps")
+    STATE = ("curiosity", "controller", "scales", "paid", "count", "recordings", "steps")
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
         self.config, self.spaces = config, spaces
@@ -74,6 +76,7 @@ class CuriosityTracker(Stateful):
             require_usable(config.beta.rule, self.controller, environments)
         smallest = {"extrinsic": 1.0, "curiosity": TINY}
         self.scales = {kind: RewardScale(config.discount, x) for kind, x in smallest.items()}
+        self.paid, self.count = 0.0, 0  # R_curiosity of all ended episodes, and their steps
         self.recordings: list[Recording | None] = [None] * environments
         self.steps = 0  # of whole episodes since the agent's last update
 
@@ -90,7 +93,9 @@ class CuriosityTracker(Stateful):
             self.end(environment, terminated=False)
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
         require_within("β", beta, largest=LARGEST_BETA)
-        self.recordings[environment] = Recording(beta, self.unit, np.zeros(len(first)), [first])
+        usual = self.paid / self.count if self.config.centred and self.count else 0.0
+        visits = np.zeros(len(first))
+        self.recordings[environment] = Recording(beta, self.unit, usual, visits, [first])
 
     def taken(self, action: Any) -> Any:
         """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
@@ -123,7 +128,7 @@ class CuriosityTracker(Stateful):
         recording.observations.append(state)
         recording.rewards.append(reward)
         recording.bonus.append(bonus)
-        paid = recording.beta * recording.unit * bonus
+        paid = recording.beta * recording.unit * (bonus - recording.usual)
         values = (reward, paid, bonus, novelty, relevance, recording.beta)
         return dict(zip(PARTS, values, strict=True))
 
@@ -135,6 +140,7 @@ class CuriosityTracker(Stateful):
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
         self.scales["extrinsic"].update(episode.rewards)
         self.scales["curiosity"].update(bonus)
+        self.paid, self.count = self.paid + total(bonus), self.count + len(episode)
         self.curiosity.remember(episode, paid_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
@@ -149,7 +155,7 @@ class CuriosityTracker(Stateful):
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 6,  # of the state itself
+            "form": 7,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
     env = CuriosityReward(gymnasium.make("FrozenLake-v1"))  # and everything else as without
 
-    reward = R_extrinsic + β · u · R_curiosity,      u = s_E / s_I
+    reward = R_extrinsic + β · u · (R_curiosity - m),      u = s_E / s_I
 
 R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages in units of their
 scale; a wrapper sees rewards only, and leaves the extrinsic one as it is. So u brings the bonus to
@@ -10,10 +10,14 @@ its unit: s_E and s_I are the standard deviations of the discounted sums of eith
 episodes so far (`RewardScale`), s_E at least 1. With β = 0.4 the sums of the bonus vary 0.4 times
 as much as those of the extrinsic reward, or 0.4 if these vary by less than 1.
 
-β and u are constant during an episode. At its end the episode becomes memory, novelty is updated,
-and β and u are set for the next. In the first episode u is 0: no bonus is paid yet. An episode that
-is reset before it ends, as by a time limit around this wrapper, ends there; where `reset` gets a
-seed, so that all begins afresh, it is forgotten.
+m is the mean of R_curiosity in all episodes so far. Without it every step would pay, and an agent
+with one critic would rather not end an episode: docs/wrappers.md has what was measured. The trainer
+has a critic for each reward. `centred=False` leaves m out, as in the paper.
+
+β, u and m are constant during an episode. At its end the episode becomes memory, novelty is
+updated, and all three are set for the next. In the first episode u is 0: no bonus is paid yet. An
+episode that is reset before it ends, as by a time limit around this wrapper, ends there; where
+`reset` gets a seed, so that all begins afresh, it is forgotten.
 """
 
 from collections.abc import Mapping
@@ -41,6 +45,7 @@ class CuriosityMixin(RecordConstructorArgs):
         beta: float | Settings = 0.4,
         *,
         relevance: bool = True,
+        centred: bool = True,
         memory: Settings | None = None,
         novelty: Settings | None = None,
         discount: float = 0.99,
@@ -83,6 +88,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
         reset: nothing is learned from one that does not.
     beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …} or "custom". Not "meta", which asks for policy gradients.
+    centred: False to pay R_curiosity itself, not what it is beyond its mean.
     relevance: False for novelty alone, without memory; `memory` is then refused.
     memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
     discount: γ of the agent (gamma in stable-baselines3), per step.

@@ -24,6 +24,7 @@ class CuriosityConfig(Section):
 
     beta: BetaRule = Field(discriminator="kind")  # a number is that constant
     relevance: bool = True  # False: the bonus is novelty alone, and memory is not used
+    centred: bool = True  # what is usual is paid with 0: a long episode as such earns nothing
     memory: MemoryConfig  # is read over `defaults`, as is the next
     novelty: NoveltyConfig
     discount: float = Field(default=0.99, ge=0, le=1)  # γ of the agent
