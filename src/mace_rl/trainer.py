@@ -45,7 +45,7 @@ class Trainer:
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
-        self.last_episodes = resuming.LastEpisodes()
+        self.last_episodes = resuming.LastEpisodes(self.environment)
 
     def _make_parts(self, streams: Streams) -> None:
         self.controller = beta_controller(self.config, self.environment, streams)

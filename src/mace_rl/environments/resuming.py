@@ -15,6 +15,10 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 
 EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
+# Environments of these modules remember nothing from one episode to the next but their generator,
+# nor do Gymnasium's plain wrappers around them.
+FORGETFUL = ("gymnasium.envs.classic_control.", "gymnasium.envs.toy_text.", "mace_rl.environments.")
+PLAIN_WRAPPERS = "gymnasium.wrappers.common"
 OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermost of its wrappers
 
 
@@ -73,17 +77,31 @@ def seeded(seed: np.random.SeedSequence) -> Iterator[None]:
         set_global_state(before)
 
 
+def is_forgetful(environment: Environment) -> bool:
+    """Whether the generator is known to be all that its next episode depends on."""
+    env: Any = environment.env
+    while env is not env.unwrapped:
+        if type(env).__module__ != PLAIN_WRAPPERS:
+            return False
+        env = env.env
+    return type(env).__module__.startswith(FORGETFUL)
+
+
 class LastEpisodes:
     """The last episodes, and the state before each; of those in a checkpoint actions and a digest.
 
     They are in two blocks. The global generators are saved before the first episode of a block.
+    Nothing is kept of an environment that `is_forgetful`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, environment: Environment) -> None:
         self.blocks: list[list[dict[str, Any]]] = [[]]
+        self.kept = not is_forgetful(environment)
 
     def begin(self, environment: Environment) -> None:
         """Before an episode."""
+        if not self.kept:
+            return
         block = self.blocks[-1]
         if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
             self.blocks = [block, []]
@@ -91,7 +109,8 @@ class LastEpisodes:
 
     def end(self, episode: Episode) -> None:
         """After an episode."""
-        self.blocks[-1][-1] |= {"actions": episode.actions, "outcome": episode}
+        if self.kept:
+            self.blocks[-1][-1] |= {"actions": episode.actions, "outcome": episode}
 
     def saved(self) -> list[list[dict[str, Any]]]:
         """For a checkpoint."""

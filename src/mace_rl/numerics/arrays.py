@@ -49,12 +49,20 @@ def quantile(values: np.ndarray, share: float) -> float:
 
 
 @kernel
-def shuffled(draws: np.ndarray) -> np.ndarray:
-    """K permutations by Fisher and Yates from uniform draws, [K, N]; draws of 1 change nothing."""
-    order = np.empty(draws.shape, np.int64)
-    for k in range(len(draws)):
-        for n in range(draws.shape[1]):
+def in_order(repeats: int, count: int) -> np.ndarray:
+    """0 … N - 1 in each of K rows, int64 [K, N]."""
+    order = np.empty((repeats, count), np.int64)
+    for k in range(repeats):
+        for n in range(count):
             order[k, n] = n
+    return order
+
+
+@kernel
+def shuffled(draws: np.ndarray) -> np.ndarray:
+    """K permutations by Fisher and Yates from uniform draws, [K, N]."""
+    order = in_order(*draws.shape)
+    for k in range(len(draws)):
         for n in range(draws.shape[1] - 1, 0, -1):
             other = min(int(draws[k, n] * (n + 1)), n)
             order[k, n], order[k, other] = order[k, other], order[k, n]
