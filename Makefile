@@ -52,9 +52,9 @@ tables: setup ## the tables, figures and verdicts of reference/studies.yaml from
 report: setup ## one page of a kept study, without training: verdicts and figures (STUDY=study)
 	@$(IN_VENV) tools.tables --report $(or $(STUDY),study)
 
-bench: setup ## speed and memory beside stable-baselines3 and PureJaxRL (an hour; BENCH=quick: a few)
+bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a change slower? (minutes)
 	@$(call one_of,BENCH,quick)
-	@$(IN_VENV) benchmarks $(if $(BENCH),--quick)
+	@$(IN_VENV) $(if $(BENCH),benchmarks.guard,benchmarks)
 
 verify: setup ## repeat some of the nine short runs, one each of tuned, plain, our tasks: to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)

@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 from shared import ROOT, Bonanza, message
 
-from benchmarks import bounds, breakdown, purejaxrl
+from benchmarks import bounds, breakdown, guard, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
 from mace_rl.study.config import read_study
@@ -287,3 +287,25 @@ def test_purejaxrl_trains():
     assert reading["steps"] == 1024
     assert 0 < reading["cpu_seconds"] < 60 and reading["seconds"] > 0
     assert reading["note"].startswith("jax 0.10.2, jaxlib 0.10.2, flax ")
+
+
+def test_the_guard_s_ratios_are_of_pairs(monkeypatch):
+    now, before = Path("now"), Path("before")
+    slower = {1000: 1.1, 1001: 1.3, 1002: 0.9}  # by seed, which each pair has of its own
+
+    def read(tree, who, env, seed, steps):
+        asked.append((tree, seed))
+        return 10.0 * (seed - 999) * (slower[seed] if tree == now else 1.0)
+
+    asked = []
+    monkeypatch.setattr(guard, "microseconds", read)
+    found = guard.compare(before, now, CARTPOLE, "ppo", 3, 99)
+    assert asked == [(before, 1000), (now, 1000), (now, 1001), (before, 1001), *asked[4:]]
+    assert guard.row(CARTPOLE, "ppo", found) == (
+        "| CartPole-v1 `ppo` | 20.0 | 26.0 | 1.10 (0.90 to 1.30) |"
+    )
+
+
+@pytest.mark.slow
+def test_the_guard_reads_a_training_of_a_tree():
+    assert 1 < guard.microseconds(ROOT, "ppo", CARTPOLE, 1000, 2048) < 10_000
