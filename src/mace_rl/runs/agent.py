@@ -58,7 +58,7 @@ class PolicyModule(TorchPolicy):
 class Outputs(torch.nn.Module):
     """Flat observations, float32 [N, observation] → logits of actions, or their means.
 
-    Plain PyTorch: a copy that `torch.jit.trace` or `torch.onnx.export` makes needs no mace_rl.
+    Plain PyTorch: what `torch.export` or `torch.onnx.export` makes of it needs no mace_rl.
     """
 
     def __init__(self, policy: PolicyModule) -> None:
