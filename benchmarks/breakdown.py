@@ -27,7 +27,7 @@ from mace_rl.environments import classic_control
 # Each part with its functions as they hang on a Trainer. What no function here accounts for is
 # bookkeeping.
 SECTIONS = {
-    "environment": "environment.env.reset environment.env.step",
+    "environment": "environment.env.unwrapped.reset environment.env.step",
     "acting": "",  # see `instrument` and `FUNCTIONS`, as for the updates
     "bookkeeping": "",
     "critics' values, advantages": "ppo.advantages_and_returns",

@@ -176,7 +176,7 @@ def test_table_2_has_the_papers_rows_then_ours() -> None:
         "Optimizer & Adam",
     ]
     assert r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)" in ours
-    assert r"Entropy Coefficient & 1 $\times$ 10$^-$$^5$ \\" in ours
+    assert r"Entropy Coefficient & 1 {\texttimes} 10\ensuremath{^-}\ensuremath{^5} \\" in ours
     assert r"tanh network (Acrobot-v1, A\_b-v0)\\my\_nets:layer\_norm (Hopper)" in ours
     assert "& 64, 32 " in ours and "None" not in ours
     # Every setting is there: five of the paper's rows and Adam, and a row for each of the others.
