@@ -67,7 +67,10 @@ def row(env: str, who: str, found: list[tuple[float, float]]) -> str:
 
 def git(*arguments: str) -> bytes:
     """What git says in this repository."""
-    return subprocess.run(["git", *arguments], cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout
+    run = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True)
+    if run.returncode:
+        sys.exit(f"guard: {' '.join(run.stderr.decode().split())}")
+    return run.stdout
 
 
 def main() -> None:
@@ -81,6 +84,8 @@ def main() -> None:
     parser.add_argument("revision", nargs="?", help=which)
     parser.add_argument("--pairs", type=int, default=PAIRS, help="default: %(default)s")
     arguments = parser.parse_args()
+    if arguments.pairs < 1:
+        parser.error(f"--pairs is {arguments.pairs}, but should be at least 1")
     changed = git("status", "--porcelain", "--untracked-files=no", "--", "src").strip()
     revision = arguments.revision or ("HEAD" if changed else "HEAD^")
     with tempfile.TemporaryDirectory() as folder:
