@@ -1,11 +1,12 @@
 """The diagnostics of an update, and a warning about observations that cannot be learned from."""
 
 import math
+from operator import attrgetter
 
 import numpy as np
 
 from mace_rl.agent.learner import Update
-from mace_rl.experience import Experience, joined
+from mace_rl.experience import Rollout
 from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser
@@ -27,24 +28,30 @@ def unseen(normaliser: RunningNormaliser) -> list[int]:
     return np.flatnonzero(tiny | offset).tolist()
 
 
+ADVANTAGES = {
+    "extrinsic": attrgetter("extrinsic_advantages"),
+    "intrinsic": attrgetter("intrinsic_advantages"),
+}
+
+
 def diagnose(
-    done: tuple[int, int, int], rollout: list[Experience], update: Update, credit: float | None
+    done: tuple[int, int, int], rollout: Rollout, update: Update, credit: float | None
 ) -> UpdateRecord:
     """The row of `diagnostics.csv` of one update.
 
     done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
-    def explained(kind: str) -> float:
-        parts = joined(rollout, f"{kind}_advantages"), joined(rollout, f"{kind}_returns")
-        return explained_variance(*parts)
-
     def mean_of(part: str) -> float:
         if getattr(rollout[0].bonus, part, None) is None:  # plain PPO, or another bonus
             return math.nan
-        return mean(joined(rollout, f"bonus.{part}"))
+        return mean(rollout.joined(lambda item: getattr(item.bonus, part)))
 
-    own, added = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_share")
+    extrinsic_variance, intrinsic_variance = (
+        explained_variance(rollout.joined(advantages), rollout.returns(kind))
+        for kind, advantages in ADVANTAGES.items()
+    )
+    own, _, added, _ = rollout.advantages
     extrinsic, weighted = dot(own, own), dot(added, added)
     number, episode, env_steps = done
     return UpdateRecord(
@@ -54,8 +61,8 @@ def diagnose(
         approximate_kl=update.approximate_kl,
         clip_fraction=update.clip_fraction,
         entropy=update.entropy,
-        explained_variance_extrinsic=explained("extrinsic"),
-        explained_variance_intrinsic=explained("intrinsic"),
+        explained_variance_extrinsic=extrinsic_variance,
+        explained_variance_intrinsic=intrinsic_variance,
         gradient_norm_actor=update.gradient_norms["actor"],
         gradient_norm_extrinsic=update.gradient_norms["extrinsic"],
         gradient_norm_intrinsic=update.gradient_norms.get("intrinsic", math.nan),

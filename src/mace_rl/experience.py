@@ -1,15 +1,17 @@
 """The rollout of an update: episodes with their bonus, advantages and returns."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.environments.rollout import Episode
 from mace_rl.numerics.arrays import mean, variance
+from mace_rl.numerics.compiling import kernel
 
 
 @dataclass(frozen=True)
@@ -27,26 +29,6 @@ class Experience:
     extrinsic_scale: float  # `PPO.advantage_scale`, by which the advantages are divided
     intrinsic_scale: float
 
-    @cached_property
-    def extrinsic_part(self) -> np.ndarray:
-        """A_E in the total advantage A_E + β A_I."""
-        return self.extrinsic_advantages / self.extrinsic_scale
-
-    @cached_property
-    def intrinsic_part(self) -> np.ndarray:
-        """A_I."""
-        return self.intrinsic_advantages / self.intrinsic_scale
-
-    @cached_property
-    def intrinsic_share(self) -> np.ndarray:
-        """β A_I."""
-        return self.beta * self.intrinsic_part
-
-    @cached_property
-    def total_advantages(self) -> np.ndarray:
-        """A_E + β A_I."""
-        return self.extrinsic_part + self.intrinsic_share
-
     def with_normalised_returns(self) -> "Experience":
         """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
         old = {k: getattr(self, f"{k}_returns") for k in ("extrinsic", "intrinsic")}
@@ -60,7 +42,64 @@ class Experience:
         return replace(self, **new)
 
 
-def joined(rollout: list[Experience], name: str) -> np.ndarray:
-    """An attribute of the episodes, "episode.actions" say, one after the other: [N, …]."""
-    part = attrgetter(name)
-    return part(rollout[0]) if len(rollout) == 1 else np.concatenate([*map(part, rollout)])
+class Advantages(NamedTuple):
+    """Of a rollout's steps, float64 [N] each, as β weighs them."""
+
+    extrinsic: np.ndarray  # A_E, in units of its scale
+    intrinsic: np.ndarray  # A_I, alike
+    share: np.ndarray  # β A_I
+    total: np.ndarray  # A_E + β A_I, the advantage of the total reward
+
+
+class Rollout(list[Experience]):
+    """The episodes of an update."""
+
+    def joined(self, part: Callable[[Experience], np.ndarray]) -> np.ndarray:
+        """A part of the episodes, one after the other, [N, …]."""
+        return part(self[0]) if len(self) == 1 else np.concatenate([*map(part, self)])
+
+    @cached_property
+    def advantages(self) -> Advantages:
+        """Those of all steps."""
+        weighed = [
+            weigh(
+                item.extrinsic_advantages,
+                item.intrinsic_advantages,
+                item.extrinsic_scale,
+                item.intrinsic_scale,
+                item.beta,
+            )
+            for item in self
+        ]
+        if len(weighed) == 1:
+            return Advantages(*weighed[0])
+        return Advantages(*map(np.concatenate, zip(*weighed, strict=True)))
+
+    @cached_property
+    def observations(self) -> np.ndarray:
+        """Float32 [N, observation], normalised."""
+        return self.joined(lambda item: item.observations)
+
+    @cached_property
+    def actions(self) -> np.ndarray:
+        """As in an `Episode`, [N, …]."""
+        return self.joined(lambda item: item.episode.actions)
+
+    @property
+    def log_probs(self) -> np.ndarray:
+        """Float32 [N], when the actions were taken."""
+        return self.joined(lambda item: item.episode.log_probs)
+
+    def returns(self, kind: str) -> np.ndarray:
+        """The λ-returns of the "extrinsic" or "intrinsic" reward, float64 [N]."""
+        if kind == "extrinsic":
+            return self.joined(lambda item: item.extrinsic_returns)
+        return self.joined(lambda item: item.intrinsic_returns)
+
+
+@kernel
+def weigh(extrinsic, intrinsic, extrinsic_scale, intrinsic_scale, beta):
+    """`Advantages` of an episode, from both kinds before scaling, float64 [T] each."""
+    own, added = extrinsic / extrinsic_scale, intrinsic / intrinsic_scale
+    share = beta * added
+    return own, added, share, own + share

@@ -33,7 +33,7 @@ from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.rollout import Episode, roll_out
 from mace_rl.environments.spaces import Spaces
-from mace_rl.experience import Experience
+from mace_rl.experience import Experience, Rollout
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
@@ -311,10 +311,10 @@ class PublishedTrainer(Trainer):
         given = episode, states[:-1], printed, bonus, returns, returns, none, none
         return Experience(*given, extrinsic_scale=1.0, intrinsic_scale=unknown)
 
-    def adapt(self, rollout: list[Experience]) -> None:
+    def adapt(self, rollout: Rollout) -> None:
         """The meta network's loss is a number on its own: nothing is learned."""
 
-    def improve(self, rollout: list[Experience]) -> Update:
+    def improve(self, rollout: Rollout) -> Update:
         """PPO on the total reward of one episode."""
         [item] = rollout
         returns = item.extrinsic_returns.astype(np.float32)

@@ -23,7 +23,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.diagnostics import diagnose, unseen
 from mace_rl.environments import resuming
 from mace_rl.environments.rollout import Episode, draw_noise, rollout_for
-from mace_rl.experience import Experience, joined
+from mace_rl.experience import Experience, Rollout
 from mace_rl.factories import beta_controller, environment, intrinsic_reward, ppo
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
@@ -82,10 +82,10 @@ class Trainer:
                 raise
             yield self.records[start:]
 
-    def collect(self) -> list[Experience]:
+    def collect(self) -> Rollout:
         """Play episodes with the current policy until a rollout is full."""
         policy = self.ppo.acting_policy()
-        rollout: list[Experience] = []
+        rollout = Rollout()
         collected = 0
         wanted = self.config.ppo.rollout_steps
         while collected < wanted and len(self.records) < self.config.episodes:
@@ -156,7 +156,7 @@ class Trainer:
             )
         )
 
-    def adapt(self, rollout: list[Experience]) -> float | None:
+    def adapt(self, rollout: Rollout) -> float | None:
         """Meta-adaptation: tell the controller what β changes in the update, before it.
 
         The update steps along the policy gradient g of the normalised total advantage, as Adam
@@ -169,23 +169,21 @@ class Trainer:
         if not self.controller.learns:
             return None
         centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
-        extrinsic, intrinsic = joined(rollout, "extrinsic_part"), joined(rollout, "intrinsic_part")
+        extrinsic, intrinsic, _, weighed = rollout.advantages
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
-        change = normalised_change(joined(rollout, "total_advantages"), intrinsic, centred)
-        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
+        change = normalised_change(weighed, intrinsic, centred)
+        acted = rollout.observations, rollout.actions
         gradient, change = learner.policy_gradients(*acted, [extrinsic, change])
         effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
 
-    def improve(self, rollout: list[Experience]) -> Update:
+    def improve(self, rollout: Rollout) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        returns = {kind: joined(rollout, f"{kind}_returns") for kind in self.ppo.critics}
-        centred = self.config.ppo.centre_advantages
-        advantages = normalised(joined(rollout, "total_advantages"), centred).astype(np.float32)
-        log_probs = joined(rollout, "episode.log_probs")
-        acted = joined(rollout, "observations"), joined(rollout, "episode.actions")
-        update = self.ppo.update(Batch(*acted, log_probs, advantages), returns)
+        returns = {kind: rollout.returns(kind) for kind in self.ppo.critics}
+        advantages = normalised(rollout.advantages.total, self.config.ppo.centre_advantages)
+        acted = rollout.observations, rollout.actions, rollout.log_probs
+        update = self.ppo.update(Batch(*acted, advantages.astype(np.float32)), returns)
         for name, norm in update.gradient_norms.items():
             require_finite(f"the {name}'s gradient norm", norm)
         # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.

@@ -26,6 +26,25 @@ def generalised_advantages(
     return result, result + values[:-1]
 
 
+@kernel
+def episode_advantages(
+    rewards: np.ndarray,
+    unit: float,
+    outputs: np.ndarray,
+    ends: bool,
+    discount: float,
+    gae_lambda: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`generalised_advantages` of rewards / unit, by the critic's outputs, float32 [T + 1, 1].
+
+    ends: whether the last state is worth 0.
+    """
+    values = outputs[:, 0].astype(np.float64)
+    if ends:
+        values[-1] = 0.0
+    return generalised_advantages(rewards / unit, values, discount, gae_lambda)
+
+
 def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
     """The discounted return-to-go of each step as it was paid, [T].
 

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Discrete
 from mace_rl.agent.distribution import log_probs, sample_categorical, sample_gaussian
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.network import CompiledMLP, Network
-from mace_rl.numerics.network_kernels import activation_buffer, forward
+from mace_rl.numerics.network_kernels import forward
 from mace_rl.numerics.normaliser import Normalisation, normalise
 
 Action = int | np.ndarray  # from 0, or float32 [actions] before clipping to the bounds
@@ -86,9 +86,8 @@ class CompiledActing(NamedTuple):
         cls, network: CompiledMLP, log_std: np.ndarray, normalisation: Normalisation
     ) -> "CompiledActing":
         """With this network."""
-        sizes = network.sizes
-        scratch = np.empty((1, sizes[0]), np.float32), activation_buffer(1, sizes)
-        return cls(normalisation, network.parameters, sizes, log_std, *scratch)
+        own = network.parameters, network.sizes, log_std
+        return cls(normalisation, *own, *network.scratch)
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         sample = act_box if len(self.log_std) else act_discrete

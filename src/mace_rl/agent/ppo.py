@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mace_rl.agent.advantages import generalised_advantages
+from mace_rl.agent.advantages import episode_advantages
 from mace_rl.agent.learner import Batch, Learner, Minibatches, Update
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
@@ -83,12 +83,10 @@ class PPO(ActorCritic, Stateful):
         """
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
-            rewards = rewards / self.reward_scale(kind)
-        values = self.critics[kind].outputs(observations)[:, 0].astype(np.float64)
-        if terminated or not self.config.bootstrap_at_time_limit:
-            values[-1] = 0.0
+        ends = terminated or not self.config.bootstrap_at_time_limit
+        paid = rewards, self.reward_scale(kind), self.critics[kind].outputs(observations), ends
         discounts = self.config.discount, self.config.gae_lambda
-        advantages, returns = generalised_advantages(rewards, values, *discounts)
+        advantages, returns = episode_advantages(*paid, *discounts)
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
         return advantages, returns

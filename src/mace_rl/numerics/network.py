@@ -74,10 +74,13 @@ class CompiledMLP:
         self.sizes = np.array([shapes[0][1], *(shape[0] for shape in shapes)])
         count = sum((inputs + 1) * padded(outputs) for outputs, inputs in shapes)
         self.parameters = np.zeros(count, np.float32)
+        # For one input and what the layers make of it, while somebody acts.
+        self.scratch = np.empty((1, shapes[0][1]), np.float32), kernels.activation_buffer(1, self.sizes)
         self.load_module_state(module.state_dict())
 
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        return self.forward(inputs).outputs
+        inputs = np.ascontiguousarray(inputs, np.float32)
+        return kernels.network_outputs(inputs, self.parameters, self.sizes)[0]
 
     def forward(self, inputs: np.ndarray) -> Trace:
         """`outputs`, and what `backward` needs of the way to them."""

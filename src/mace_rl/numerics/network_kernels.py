@@ -16,6 +16,8 @@ from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import f32, tanh
 from mace_rl.numerics.products import Matrix, add_product, address, by_tiles, dot, padded, product
 
+FEW = 4  # columns of a last layer; a tile computes 16 at once
+
 
 @kernel
 def activation_buffer(count, sizes):
@@ -99,13 +101,33 @@ def backward(inputs, activations, grad_outputs, back, sizes, gradient, grad_acti
         below = activations[below_start:below_end]
         flat = grad_activations[below_start:below_end]
         below_end = below_start
-        add_product(below.reshape(count, width).T, grad, change[:ins])
+        if outs <= FEW:
+            add_by_columns(below.reshape(count, width), grad, change, outs)
+        else:
+            add_product(below.reshape(count, width).T, grad, change[:ins])
         grad_below = flat.reshape(count, width)
         product(grad, weights, np.zeros(width, np.float32), grad_below)
         for k in range(len(flat)):
             flat[k] *= f32(1) - below[k] * below[k]  # tanh'
         grad = grad_below
     return grad
+
+
+@kernel
+def add_by_columns(below, grad, change, outs):
+    """C + Aᵀ · B for B with few columns that are not padding: with C's in the place of its rows.
+
+    A, below: [N, padded in]; B, grad: [N, padded out]; C, the first rows of change, [in + 1, padded
+    out]. The bits are those of `add_product`, since each element is the same chain.
+    """
+    columns = np.zeros((outs, below.shape[1]), np.float32)
+    for i in range(len(change) - 1):
+        for j in range(outs):
+            columns[j, i] = change[i, j]
+    add_product(grad.T[:outs], below, columns)
+    for i in range(len(change) - 1):
+        for j in range(outs):
+            change[i, j] = columns[j, i]
 
 
 @kernel

@@ -48,7 +48,13 @@ class Normalisation(NamedTuple):
     @classmethod
     def of(cls, mean: np.ndarray, std: np.ndarray, clip: float) -> "Normalisation":
         """From a running mean and standard deviation, [observation]."""
-        return cls(mean.astype(np.float32), (1.0 / std).astype(np.float32), np.float32(clip))
+        return cls(*centre_and_inverse(mean, std), np.float32(clip))
+
+
+@kernel
+def centre_and_inverse(mean, std):
+    """Mean and 1 / std as float32, [size] each."""
+    return mean.astype(np.float32), (1 / std).astype(np.float32)
 
 
 @kernel
@@ -81,7 +87,7 @@ def spread(count, sum_of_squares, std, varied):
 def standardised(observations, mean, std, bound):
     """`normalise` of each row, to the bit, float32 [N, size]."""
     result = np.empty(observations.shape, np.float32)
-    centre, inverse = mean.astype(np.float32), (1 / std).astype(np.float32)
+    centre, inverse = centre_and_inverse(mean, std)
     clip = np.float32(bound)
     for n in range(len(observations)):  # a call for each row takes ten times as long
         for i in range(len(centre)):
