@@ -36,14 +36,18 @@ class Adam(Stateful):
         self, parameters: np.ndarray, learning_rate: float, max_gradient_norm: float = math.inf
     ) -> None:
         self.parameters = parameters
+        self.rates = learning_rate, max_gradient_norm
         self.mean, self.square = np.zeros_like(parameters), np.zeros_like(parameters)
         self.decayed = np.ones(2)
-        arrays = parameters, self.mean, self.square, self.decayed
-        self.state = AdamState(*arrays, learning_rate, max_gradient_norm)  # for compiled code
 
     def step(self, gradient: np.ndarray) -> float:
         """One step against `gradient`, [n]; returns the gradient's norm before clipping."""
         return step(gradient, self.state)
+
+    @property
+    def state(self) -> AdamState:
+        """For the compiled `step`."""
+        return AdamState(self.parameters, self.mean, self.square, self.decayed, *self.rates)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         """`direction`, [n], in the units in which this optimiser steps: over √v̂ + ε, float32 [n].
