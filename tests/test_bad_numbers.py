@@ -79,7 +79,7 @@ def test_bad_weights_stop_the_run_and_say_whose(run_config, part, message, place
 
     def spoil(value):
         if part == "meta":
-            trainer.controller.network.bias[place] = value
+            trainer.controller.network.weights.bias[place] = value
             return
         own = np.flatnonzero(Twin(owner).own())  # none of the zeros that are added
         getattr(owner, "network", owner).parameters[own[place]] = value

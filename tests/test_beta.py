@@ -1,4 +1,4 @@
-"""β by schedule and by meta-adaptation: each against a computation of its own."""
+"""β by schedule, and pretrained: each against a computation of its own."""
 
 import math
 
@@ -10,7 +10,7 @@ from mace_rl.beta.controller import Effect
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
-from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.environments.rollout import Episode
 from mace_rl.factories import beta_controller
 from mace_rl.streams import Streams
@@ -75,12 +75,12 @@ def test_windows_of_any_budget(budget, windows):
 
 @pytest.fixture
 def make(run_config):
-    """`make(episodes, initial, **settings of meta)`: the controller of mace_full."""
+    """`make(episodes, initial, **settings)`: the controller of mace_pretrained."""
 
-    def build(episodes=1000, initial=0.4, **settings) -> MetaAdaptation:
-        beta = {"kind": "meta", "initial": initial}
-        changes = {"episodes": episodes, "beta": beta, "meta": settings}
-        config = run_config("CartPole-v1", "mace_full", 0, **changes)
+    def build(episodes=1000, initial=0.4, **settings) -> PretrainedAdaptation:
+        beta = {"kind": "pretrained", "initial": initial}
+        changes = {"episodes": episodes, "beta": beta, "pretrained": settings}
+        config = run_config("CartPole-v1", "mace_pretrained", 0, **changes)
         return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
 
     return build
@@ -88,7 +88,7 @@ def make(run_config):
 
 @pytest.mark.parametrize("initial", [0.05, 0.4, 0.9])
 def test_beta_starts_at_initial_and_stays_there_without_its_parts(make, initial):
-    controller, alone = make(100, initial), make(100, initial, pretrained=False, credit_gain=0.0)
+    controller, alone = make(100, initial), make(100, initial, lstm=False, credit_gain=0.0)
     assert controller.learns and not alone.learns
     for n in range(100):
         assert (controller.beta == pytest.approx(initial)) == (n == 0)
@@ -97,7 +97,7 @@ def test_beta_starts_at_initial_and_stays_there_without_its_parts(make, initial)
         alone.next_episode(episode_of(n), np.full(8, 1 / (1 + n)))
 
 
-@pytest.mark.parametrize("settings", [{}, {"pretrained": False}, {"credit_gain": 0.5}])
+@pytest.mark.parametrize("settings", [{}, {"lstm": False}, {"credit_gain": 0.5}])
 def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, settings):
     """Its logit, by another sum over all credits; at most 6."""
     settings = {"horizon": 1, "credit_threshold": 0.5} | settings
@@ -115,7 +115,7 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
         betas.append(controller.beta)
         assert betas[-1] == pytest.approx(1 / (1 + math.exp(-np.clip(logit, -6, 6))), rel=1e-4)
         controller.next_episode(episode_of(n % 7), np.full(8, 1 / (1 + n)))
-        if gauge.update(n % 7, 8 / (1 + n), 8) and settings.get("pretrained", True):
+        if gauge.update(n % 7, 8 / (1 + n), 8) and settings.get("lstm", True):
             known = lstm_logit(gauge.sequence(), network)
     assert len(credits) == 199 and max(betas) > 0.9 and min(betas) < 0.05
 
@@ -154,7 +154,7 @@ def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(m
 )
 def test_the_integrator_as_a_detector(run_config, signal, low, high):
     """After 1500 invented credits with noise 1, β lies there in 9 of 10 seeds."""
-    config = run_config("CartPole-v1", "mace_full", 0).meta
+    config = run_config("CartPole-v1", "mace_pretrained", 0).pretrained
     paths = []
     for seed in range(200):
         integrator, rng = Integrator(config), np.random.default_rng(seed)
@@ -170,12 +170,27 @@ def test_the_integrator_as_a_detector(run_config, signal, low, high):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("variant", ["mace_full", "mace_pretrained"])
 @pytest.mark.parametrize(
     ("problem", "low", "high"), [("Help", 0.6, 1), ("Harm", 0, 0.1), ("Nothing", 0.1, 0.6)]
 )
-def test_planted_problems(problem, low, high):
+def test_planted_problems(problem, low, high, variant):
     """A bonus that helps, one that harms, one without any bearing; all starting from β = 0.4."""
-    study = read_study([ROOT / "config.yaml", ROOT / "config" / "planted.yaml"])
-    config = study.run_config(f"Planted{problem}-v0", "mace_full", 0)
+    late = planted_betas(f"Planted{problem}-v0", variant)
+    assert low <= late.mean() <= high
+
+
+@pytest.mark.slow
+def test_the_network_reads_which_kind_of_episode_comes_next():
+    """In the first kind, odd ones, the bonus helps, in the second it harms; a sum sees neither."""
+    late = planted_betas("PlantedMixed-v0", "mace_full")
+    assert late[0::2].mean() > 0.8 and late[1::2].mean() < 0.1
+    assert np.ptp(planted_betas("PlantedMixed-v0", "mace_credit")) < 0.2
+
+
+def planted_betas(environment: str, variant: str) -> np.ndarray:
+    """β of the last 80 of 800 episodes."""
+    over = [ROOT / "config" / f"{name}.yaml" for name in ("questions", "planted")]
+    config = read_study([ROOT / "config.yaml", *over]).run_config(environment, variant, 0)
     records = finish(config.model_copy(update={"episodes": 800})).records
-    assert low <= np.mean([record.beta for record in records[-80:]]) <= high
+    return np.array([record.beta for record in records[-80:]])

@@ -127,9 +127,9 @@ def watched(request, run_config) -> Watched:
         "episodes": 14,
         "engine": engine,
         "ppo": {"rollout_steps": steps, "gae_lambda": 0.95, "centre_advantages": several},
-        "meta": {"horizon": 2},
+        "pretrained": {"horizon": 2},
     }
-    trainer = Watched(run_config(environment, "mace_full", 2, **changes))
+    trainer = Watched(run_config(environment, "mace_pretrained", 2, **changes))
     assert [record.episode for record in finish(trainer).records] == [*range(1, 15)]
     assert (max(len(each.rollout) for each in trainer.rounds) > 1) == several
     return trainer

@@ -12,7 +12,7 @@ from shared import LAYER_NORM, laid_out
 
 from mace_rl.agent.custom import custom_module
 from mace_rl.beta.lstm import MetaNetwork, lstm_logit, read_network
-from mace_rl.beta.meta import WEIGHTS
+from mace_rl.beta.pretrained import WEIGHTS
 from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled
@@ -98,7 +98,7 @@ def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
 
 
 @pytest.mark.parametrize("length", [1, 40])
-@pytest.mark.parametrize("units", [1, 5, None])
+@pytest.mark.parametrize("units", [4, 12, None])
 def test_meta_network_is_pytorch_s_lstm_with_a_readout(units, length):
     """With drawn weights, or those that come with the package.
 

@@ -14,6 +14,7 @@ from mace_rl import published
 from mace_rl.config.published import PublishedConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.rollout import Episode
+from mace_rl.experience import Rollout
 from mace_rl.library import settings
 from mace_rl.published import PublishedTrainer
 from mace_rl.runs import run
@@ -170,6 +171,6 @@ def test_plain_ppo_keeps_its_deviation_and_normalises_the_total_return(engine):
     total = item.extrinsic_returns + item.beta * item.intrinsic_returns
     assert total.mean() == pytest.approx(0) and total.std(ddof=1) == pytest.approx(1)
     before = trainer.ppo.policy.parameters.copy()
-    trainer.improve([item])
+    trainer.improve(Rollout([item]))
     assert trainer.ppo.policy.log_std.tolist() == pytest.approx([np.log(0.6)])
     assert not np.array_equal(before, trainer.ppo.policy.parameters)

@@ -10,6 +10,7 @@ from shared import LAYER_NORM, NETWORKS, ROOT, SOON, VARIANTS, Bonanza, Twin, fi
 
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.config.reading import merge
 from mace_rl.experience import Experience
 from mace_rl.records import EpisodeRecord
@@ -230,15 +231,18 @@ def learned(trainer: Trainer) -> list[bytes]:
     ],
 )
 def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, settings):
-    changes = {"episodes": 12, "meta": {"horizon": 1}, "novelty": SOON} | SETTINGS[settings]
+    judged = {"horizon": 1}
+    changes = {"episodes": 12, "meta": judged, "pretrained": judged, "novelty": SOON} | SETTINGS[settings]
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
     fixed = finish(run_config(environment, "mace_fixed", 3, beta=zero, **changes))
-    monkeypatch.setattr(MetaAdaptation, "beta", property(lambda self: 0.0))
+    for controller in (MetaAdaptation, PretrainedAdaptation):
+        monkeypatch.setattr(controller, "beta", property(lambda self: 0.0))
     full = finish(run_config(environment, "mace_full", 3, **changes))
+    ours = finish(run_config(environment, "mace_pretrained", 3, **changes))
     some = finish(run_config(environment, "mace_fixed", 3, **changes))
     assert learned(some)[0] != learned(plain)[0]  # else a bonus that is lost would pass, too
-    for trainer in (fixed, full):
+    for trainer in (fixed, full, ours):
         assert without_bonus(trainer.records) == without_bonus(plain.records)
         assert learned(trainer) == learned(plain)
         assert trainer.noise.bit_generator.state == plain.noise.bit_generator.state
@@ -246,7 +250,8 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
         assert sum(record.intrinsic_return for record in trainer.records) > 10
         assert len(trainer.curiosity.memory) > 0
         assert len(trainer.curiosity.novelty.visited) > 100  # so that all of novelty is estimated
-    assert full.controller.integrator.squares > 0 and len(full.controller.gauge.windows) == 12
+    assert full.controller.evidence.weight > 0
+    assert ours.controller.integrator.squares > 0 and len(ours.controller.gauge.windows) == 12
 
 
 def test_another_seed_is_another_run(run_config):
@@ -286,6 +291,7 @@ def test_global_generators_are_left_alone(run_config, settings):
         ("FrozenLake-v1", "mace_fixed", "several"),
         ("HopperBulletEnv-v0", "mace_full", "an episode"),
         ("FrozenLake-v1", "mace_full", "torch"),
+        ("CartPole-v1", "mace_pretrained", "several"),
         ("Pendulum-v1", "mace_full", "a network of one's own"),
     ],
 )
@@ -293,14 +299,16 @@ def test_state_holds_all_that_the_rest_depends_on(run_config, environment, varia
     """Continued by a new trainer from what a file would hold, with several episodes a rollout."""
     changes = {"episodes": 16, "ppo": {"rollout_steps": 25}}
     changes["novelty"] = SOON | {"refresh_every": 60}  # so that some states wait
-    changes["meta"] = {"horizon": 2, "credit_threshold": 0.0}  # and each credit moves β
+    # And each credit moves β.
+    changes["meta"] = {"horizon": 2, "evidence_chance": 0.999, "evidence_scale": 0.1}
+    changes["pretrained"] = {"horizon": 2, "credit_threshold": 0.0}
     config = run_config(environment, variant, 2, **merge(SETTINGS[settings], changes))
     whole = Trainer(config)
     rounds = whole.run()
     for _ in range(3):
         next(rounds)
     state = archive(whole.state_dict())
-    if variant == "mace_full":
+    if variant in ("mace_full", "mace_pretrained"):
         assert len(whole.controller.judge.directions) == 2
     for _ in rounds:
         pass

@@ -14,6 +14,7 @@ from mace_rl.agent.ppo import PPO, ActorCritic
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
@@ -25,6 +26,7 @@ from mace_rl.config.beta import (
     ExponentialBeta,
     MetaBeta,
     NoBonus,
+    PretrainedBeta,
 )
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
@@ -45,13 +47,17 @@ def beta_controller(
             return None
         case MetaBeta(initial=initial):
             assert config.meta is not None  # `RunConfig` checked that
-            return MetaAdaptation(config.meta, initial, config.episodes)
+            own = environment, config.engine, streams["meta"]
+            return MetaAdaptation(config.meta, initial, *own)
+        case PretrainedBeta(initial=initial):
+            assert config.pretrained is not None
+            return PretrainedAdaptation(config.pretrained, initial, config.episodes)
         case rule:
             return beta_rule(rule, streams["beta"])
 
 
 def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
-    """What sets β, unless it is the meta network."""
+    """What sets β, unless it is learned from policy gradients."""
     match settings:
         case ConstantBeta():
             return Constant(settings)

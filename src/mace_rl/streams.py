@@ -8,7 +8,7 @@ import numpy as np
 # A stream's place here is its key, so new streams go at the end.
 STREAMS = (
     *("environment", "actions", "minibatches", "actor", "extrinsic_critic", "intrinsic_critic"),
-    # "density" and what follows it: of the bonus and β; "meta" and "dropout" in `published` alone.
+    # "density" and what follows it: of the bonus and β; "dropout" in `published` alone.
     *("density", "density_batches", "meta", "novelty", "beta", "bonus", "dropout"),
     "global",  # seeds Python's, NumPy's and PyTorch's own, from which other people's code may draw
 )

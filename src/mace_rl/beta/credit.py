@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from mace_rl.beta.controller import Effect
-from mace_rl.config.beta import MetaConfig
+from mace_rl.config.beta import CreditConfig, PretrainedConfig
 from mace_rl.numerics.products import dot
 from mace_rl.state import Stateful
 
@@ -31,7 +31,7 @@ class Judge(Stateful):
 
     STATE = ("directions", "strengths", "credits", "alignments", "alignment_weight")
 
-    def __init__(self, config: MetaConfig) -> None:
+    def __init__(self, config: CreditConfig) -> None:
         self.horizon, self.bound = config.horizon, config.max_credit
         # Of each β that is being judged, the oldest first:
         self.directions: list[np.ndarray] = []  # what it changes in the policy, of length 1, or 0
@@ -84,7 +84,7 @@ class Integrator(Stateful):
 
     STATE = ("count", "expected", "sum", "squares")
 
-    def __init__(self, config: MetaConfig) -> None:
+    def __init__(self, config: PretrainedConfig) -> None:
         self.gain, self.threshold = config.credit_gain, config.credit_threshold
         self.count, self.expected, self.sum, self.squares = 0, 0.0, 0.0, 0.0
 

@@ -1,6 +1,7 @@
-"""The meta network, an LSTM and a readout (paper, supplement), as it answers; it learns elsewhere.
+"""Long short-term memory and a readout in compiled code, with gradients by backpropagation in time.
 
-`tools/meta` trains it, in PyTorch. Written out here, it has equal bits on every processor.
+For 16 units a tensor library's calls take longer than the work in them. All arithmetic is float32
+in a fixed order, the same bits on every processor.
 """
 
 from pathlib import Path
@@ -9,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.elementary import fma, sigmoid, tanh
+from mace_rl.numerics.elementary import f32, fma, sigmoid, tanh
+from mace_rl.numerics.products import add_product, product
 
 
 class MetaNetwork(NamedTuple):
     """The weights of an LSTM with H units (Hochreiter & Schmidhuber 1997) and a readout; float32.
 
-    Columns of gates: input, forget and output gate, candidate.
+    Columns of gates: input, forget and output gate, candidate. H is a multiple of 4.
     """
 
     weight_ih: np.ndarray  # [in, 4 H]
@@ -23,6 +25,21 @@ class MetaNetwork(NamedTuple):
     bias: np.ndarray  # [4 H]
     readout: np.ndarray  # [H]
     readout_bias: np.ndarray  # [1]
+
+    @classmethod
+    def shapes(cls, inputs: int, units: int) -> "list[tuple[int, ...]]":
+        """Of the weights, in their order."""
+        return [(inputs, 4 * units), (units, 4 * units), (4 * units,), (units,), (1,)]
+
+    @classmethod
+    def of(cls, vector: np.ndarray, inputs: int, units: int) -> "MetaNetwork":
+        """Views of a vector that has all weights one after the other, float32 [n]."""
+        views, start = [], 0
+        for shape in cls.shapes(inputs, units):
+            end = start + int(np.prod(shape))
+            views.append(vector[start:end].reshape(shape))
+            start = end
+        return cls(*views)
 
 
 def read_network(path: Path) -> MetaNetwork:
@@ -32,27 +49,75 @@ def read_network(path: Path) -> MetaNetwork:
 
 
 @kernel
-def lstm_logit(sequence: np.ndarray, network: MetaNetwork) -> np.float32:
-    """The readout of the last hidden state after a sequence, float32 [T, in], from a zero state."""
-    size = len(network.readout)
-    hidden, cell = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    for x in sequence:
-        gates = network.bias.copy()
-        accumulate(x, network.weight_ih, gates)
-        accumulate(hidden, network.weight_hh, gates)
+def lstm_states(sequence, network):
+    """Gates after their functions, [T, 4 H], cells and hidden states, [T + 1, H], from zero states.
+
+    sequence: float32 [T, in].
+    """
+    steps, size = len(sequence), len(network.readout)
+    gates = np.empty((steps, 4 * size), np.float32)
+    product(sequence, network.weight_ih, network.bias, gates)
+    cells, hidden = np.zeros((2, steps + 1, size), np.float32)
+    for t in range(steps):
+        add_product(hidden[t : t + 1], network.weight_hh, gates[t : t + 1])
+        gate, before, cell, shown = gates[t], cells[t], cells[t + 1], hidden[t + 1]
+        sigmoids, candidate = gate[: 3 * size], gate[3 * size :]
+        for j in range(3 * size):
+            sigmoids[j] = sigmoid(sigmoids[j])
         for j in range(size):
-            input_gate, forget_gate = sigmoid(gates[j]), sigmoid(gates[size + j])
-            output_gate, candidate = sigmoid(gates[2 * size + j]), tanh(gates[3 * size + j])
-            cell[j] = forget_gate * cell[j] + input_gate * candidate
-            hidden[j] = output_gate * tanh(cell[j])
-    logit = network.readout_bias.copy()
-    accumulate(hidden, network.readout.reshape(-1, 1), logit)
-    return logit[0]
+            candidate[j] = tanh(candidate[j])
+        for j in range(size):
+            cell[j] = gate[size + j] * before[j] + gate[j] * candidate[j]
+        for j in range(size):
+            shown[j] = gate[2 * size + j] * tanh(cell[j])
+    return gates, cells, hidden
 
 
 @kernel
-def accumulate(vector, weights, result):
-    """Add vector · weights, [n] · [n, m], to `result`, [m]: chains of fused multiply-adds."""
-    for i in range(len(vector)):
-        for j in range(len(result)):
-            result[j] = fma(vector[i], weights[i, j], result[j])
+def read_out(hidden, network):
+    """The readout of the last hidden state: a chain of fused multiply-adds."""
+    logit, last = network.readout_bias[0], hidden[-1]
+    for j in range(len(last)):
+        logit = fma(last[j], network.readout[j], logit)
+    return logit
+
+
+@kernel
+def lstm_logit(sequence: np.ndarray, network: MetaNetwork) -> np.float32:
+    """The readout of the last hidden state after a sequence, float32 [T, in], from a zero state."""
+    return read_out(lstm_states(sequence, network)[2], network)
+
+
+@kernel
+def add_gradient(sequence, states, network, grad_logit, gradient):
+    """Add ∇ of `grad_logit` times the readout to `gradient`, a `MetaNetwork` of arrays alike.
+
+    states: of `lstm_states` for this sequence. Backpropagation through time.
+    """
+    (gates, cells, hidden), size, one = states, len(network.readout), f32(1)
+    steps = len(sequence)
+    back = network.weight_hh.T.copy()
+    changes = np.empty_like(gates)
+    grad_hidden, grad_cell = np.empty((1, size), np.float32), np.zeros(size, np.float32)
+    nothing = np.zeros(size, np.float32)
+    for j in range(size):
+        grad_hidden[0, j] = grad_logit * network.readout[j]
+        gradient.readout[j] += grad_logit * hidden[steps, j]
+    gradient.readout_bias[0] += grad_logit
+    for t in range(steps - 1, -1, -1):
+        gate, change, grad = gates[t], changes[t], grad_hidden[0]
+        for j in range(size):
+            input_gate, forget_gate = gate[j], gate[size + j]
+            output_gate, candidate = gate[2 * size + j], gate[3 * size + j]
+            shown = tanh(cells[t + 1, j])
+            grad_cell[j] += grad[j] * output_gate * (one - shown * shown)
+            change[j] = grad_cell[j] * candidate * input_gate * (one - input_gate)
+            change[size + j] = grad_cell[j] * cells[t, j] * forget_gate * (one - forget_gate)
+            change[2 * size + j] = grad[j] * shown * output_gate * (one - output_gate)
+            change[3 * size + j] = grad_cell[j] * input_gate * (one - candidate * candidate)
+            grad_cell[j] *= forget_gate
+        product(changes[t : t + 1], back, nothing, grad_hidden)
+    add_product(sequence.T, changes, gradient.weight_ih)
+    add_product(hidden[:-1].T, changes, gradient.weight_hh)
+    ones = np.ones((1, steps), np.float32)
+    add_product(ones, changes, gradient.bias.reshape(1, 4 * size))

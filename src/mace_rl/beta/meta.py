@@ -1,72 +1,186 @@
-"""β by meta-adaptation: an LSTM that has learned how to explore, and the credit of earlier βs."""
+"""β by the paper's meta-adaptation network: an LSTM that reads the last episode, and learns.
 
-from pathlib import Path
+The paper (supplement): its input is "a sequence of the agent's experiences from the preceding
+episode, including states, actions, and rewards", its output "determines the β for the next
+episode", and it "is trained with its own optimizer". It names no loss. Ours is the credit of β
+(`beta.credit`): what a little more of it did to the extrinsic return.
+"""
+
+import math
+from collections import deque
 
 import numpy as np
+from gymnasium.spaces import Discrete
 
 from mace_rl.beta.controller import BetaController, Effect
-from mace_rl.beta.credit import Integrator, Judge
-from mace_rl.beta.gauge import Gauge
-from mace_rl.beta.lstm import lstm_logit, read_network
+from mace_rl.beta.credit import Judge
+from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork, TorchMetaNetwork
+from mace_rl.beta.squash import beta_of, logit
 from mace_rl.config.beta import MetaConfig
 from mace_rl.environments.rollout import Episode
-from mace_rl.numerics.arrays import total
+from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.elementary import exp, log
+from mace_rl.numerics.normaliser import RunningNormaliser, standardised
 from mace_rl.state import Stateful
 
-WEIGHTS = Path(__file__).with_name("weights.npz")  # tools/meta made them
-LARGEST_LOGIT = 6.0  # of β
+CLIP = 5.0  # bound of what the LSTM reads, in standard deviations
+SIZE_DECAY = 0.99  # of the running mean that says how large outputs usually are, per credit
 
 
 class MetaAdaptation(Stateful, BetaController):
-    """The logit of β is the LSTM's answer plus what the credit of earlier βs adds up to.
+    """Sets β for the next episode from the steps of the last one; see the module."""
 
-    The LSTM reads how the whole training went so far, window by window, and does not learn in a
-    run: its weights come from many short trainings on generated tasks. The credit corrects it where
-    the gradients of this training show that more or less β helps.
-    """
+    STATE = (
+        *("network", "evidence", "judge", "normaliser"),
+        *("source", "sources", "judged"),
+    )
+    learns = True
 
-    STATE = ("gauge", "judge", "integrator", "lstm_part")
-
-    def __init__(self, config: MetaConfig, initial: float, episodes: int) -> None:
-        """initial: β before the first window closes; episodes: the budget."""
-        self.learns = config.credit_gain > 0
-        self.network = read_network(WEIGHTS) if config.pretrained else None
-        self.gauge, self.judge, self.integrator = Gauge(episodes), Judge(config), Integrator(config)
-        self.lstm_part = logit(initial)
+    def __init__(
+        self,
+        config: MetaConfig,
+        initial: float,
+        spaces: Spaces,
+        engine: str,
+        generator: np.random.Generator,
+    ) -> None:
+        """initial: β as long as nothing has been learned."""
+        self.config, self.initial = config, logit(initial)
+        self.actions = spaces.action_size if isinstance(spaces.action_space, Discrete) else 0
+        inputs = spaces.observation_size + spaces.action_size + 2
+        kind = CompiledMetaNetwork if engine == "compiled" else TorchMetaNetwork
+        self.network: LearningNetwork = kind(config, inputs, generator)
+        self.judge, self.evidence = Judge(config), Evidence(config)
+        self.normaliser = RunningNormaliser(inputs)  # of what the LSTM reads
+        # What was read for β: of the next episode, None before the first; of each since the last
+        # update; and of each rollout whose β is being judged, with the mean output.
+        self.source: np.ndarray | None = None
+        self.sources: list[np.ndarray] = []
+        self.judged: deque[tuple[list[np.ndarray], float]] = deque()
+        self.output: float | None = None  # for `source`, once somebody has asked
 
     @property
     def beta(self) -> float:
-        """See `BetaController`."""
-        return beta_of(self.lstm_part + self.integrator.logit)
+        """See `BetaController`; from the network as it is now."""
+        if self.source is None:
+            return beta_of(self.initial)
+        if self.output is None:
+            self.output = self.network.output(self.source)
+        return beta_of(self.initial + self.evidence.logit(self.output))
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
-        closed = self.gauge.update(total(episode.rewards), total(bonus), len(episode))
-        if closed and self.network is not None:
-            self.lstm_part = float(lstm_logit(self.gauge.sequence(), self.network))
+        if self.source is not None:
+            self.sources.append(self.source)
+        self.source, self.output = self.read(episode, bonus), None
+
+    def read(self, episode: Episode, bonus: np.ndarray) -> np.ndarray:
+        """What the LSTM reads of an episode, float32 [at most `chunks`, in].
+
+        The episode is cut into equal stretches. Each row has their mean observation, action
+        (one-hot if Discrete), reward and bonus, standardised by all rows so far.
+        """
+        if not self.config.reads:
+            return np.zeros((1, len(self.normaliser.mean)), np.float32)
+        actions = episode.actions
+        if self.actions:
+            actions = np.eye(self.actions, dtype=np.float32)[actions]
+        seen = episode.observations.shape[1]
+        rows = stretches(episode.observations, actions, episode.rewards, bonus, self.config.chunks)
+        self.normaliser.update(rows)
+        found = standardised(rows, self.normaliser.mean, self.normaliser.std, CLIP)
+        found[:, :seen] /= np.float32(math.sqrt(seen))  # so that many weigh no more than few
+        return found
 
     def learn(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
         """See `BetaController`."""
         credit = self.judge.judge(gradient, strength, effect)
-        if credit is not None:
-            self.integrator.add(credit, self.gauge.progress)
+        several = len(self.sources) > self.config.sequences
+        chosen = self.sources
+        if several:
+            places = np.arange(self.config.sequences) * len(chosen) // self.config.sequences
+            chosen = [chosen[place] for place in places]
+        outputs = [self.network.output(sequence) for sequence in chosen]
+        self.judged.append((chosen, sum(outputs) / max(len(outputs), 1)))
+        self.sources = []
+        if credit is None:
+            return None
+        sequences, output = self.judged.popleft()
+        if sequences:  # the first episode's β was given
+            self.evidence.add(credit, output)
+            self.network.learn(sequences, credit)
+            self.output = None
         return credit
 
 
-def beta_of(logit: float) -> float:
-    """The β with this logit, which is bounded so that β can come back; NaN stays NaN."""
-    return logistic(np.float32(min(max(logit, -LARGEST_LOGIT), LARGEST_LOGIT)))
+class Evidence(Stateful):
+    """Whether the outputs o, before their credits c came, had the right sign.
+
+    S = Σ c u, with u the output in units of its usual size, at most 1. Each u is known before its
+    c, so S has mean 0 if β changes nothing, whatever the network has learned from noise. V = Σ (c u)²
+    is its variance. Only what is beyond Robbins' bound (1970), which chance crosses in a share of
+    all trainings however long they are, moves β.
+    """
+
+    STATE = ("sum", "variance", "size", "weight")
+
+    def __init__(self, config: MetaConfig) -> None:
+        self.config = config
+        self.sum, self.variance = 0.0, 0.0
+        self.size, self.weight = 0.0, 0.0  # running sum of o², and of the weights in it
+
+    def unit(self, output: float) -> float:
+        """u; NaN stays NaN."""
+        if not self.size:
+            return 0.0 * output
+        return min(max(output / math.sqrt(self.size / self.weight), -1.0), 1.0)
+
+    def add(self, credit: float, output: float) -> None:
+        """Take in one more credit, of the output that set its β."""
+        term = credit * self.unit(output)
+        self.sum += term
+        self.variance += term**2
+        self.size = SIZE_DECAY * self.size + output**2
+        self.weight = SIZE_DECAY * self.weight + 1
+
+    @property
+    def beyond_chance(self) -> float:
+        """How far S is beyond the bound, in standard deviations; 0 if it is not.
+
+        The bound is √((V + ρ) (2 ln 1/α + ln (V + ρ)/ρ)): S crosses it, above or below, with
+        probability α at most.
+        """
+        known, chance = self.variance + self.config.evidence_scale, self.config.evidence_chance
+        bound = 2 * math.log(1 / chance) + math.log(known / self.config.evidence_scale)
+        return max(self.sum / math.sqrt(known) - math.sqrt(bound), 0.0)
+
+    def logit(self, output: float) -> float:
+        """What `output` adds to β's logit."""
+        if not self.config.trusts_evidence:
+            return output
+        return self.config.gain * self.beyond_chance * self.unit(output)
 
 
 @kernel
-def logistic(x: np.float32) -> float:
-    """1 / (1 + e⁻ˣ), float64."""
-    return 1 / (1 + np.float64(exp(-x)))
+def stretches(observations, actions, rewards, bonus, most):
+    """Means over `most` equal stretches of an episode of T steps, or its steps if it has fewer.
 
-
-@kernel
-def logit(beta: float) -> float:
-    """log(β / (1 - β)), of a float64 in (0, 1), to float32's rounding."""
-    return log(np.float32(beta / (1 - beta)))
+    observations: [T + 1, observation], the last of which is not read; actions: [T, actions];
+    rewards, bonus: [T]. Float64 [stretches, observation + actions + 2].
+    """
+    steps, seen = len(rewards), observations.shape[1]
+    count, size = min(most, steps), seen + actions.shape[1]
+    result = np.zeros((count, size + 2))
+    for k in range(count):
+        first, end = k * steps // count, (k + 1) * steps // count
+        row = result[k]
+        for t in range(first, end):
+            for i in range(seen):
+                row[i] += observations[t, i]
+            for i in range(actions.shape[1]):
+                row[seen + i] += actions[t, i]
+            row[size] += rewards[t]
+            row[size + 1] += bonus[t]
+        for i in range(size + 2):
+            row[i] /= end - first
+    return result

@@ -1,4 +1,4 @@
-"""Settings of `mace_rl.beta`: what sets β, from nothing to meta-adaptation."""
+"""Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
 
 from typing import Literal
 
@@ -8,14 +8,35 @@ from mace_rl.config.section import Arguments, Count, Reference, Section
 from mace_rl.records import LARGEST_BETA
 
 
-class MetaConfig(Section):
-    """Meta-adaptation: a pretrained LSTM (paper, supplement), and the credit of earlier βs."""
+class CreditConfig(Section):
+    """How a β is judged by the updates that follow: docs/method.md."""
 
-    pretrained: bool  # false: no LSTM, in whose place stands the initial β
-    credit_gain: NonNegativeFloat  # of β's logit per unit of z beyond the threshold; 0: no credit
-    credit_threshold: NonNegativeFloat  # of |z|, the sum of the credits in units of its noise
     horizon: Count  # updates after a rollout that judge its β
     max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
+
+
+class MetaConfig(CreditConfig):
+    """The meta-adaptation network, which learns during the run (paper, supplement)."""
+
+    hidden_units: Count = Field(multiple_of=4)
+    learning_rate: PositiveFloat
+    max_gradient_norm: PositiveFloat
+    output_decay: NonNegativeFloat  # λ in its loss, -c o + λ o² / 2
+    chunks: Count  # rows at most that it reads of an episode
+    sequences: Count  # episodes at most, of a rollout, that it learns from
+    evidence_chance: float = Field(gt=0, lt=1)  # of trainings in which β may move for nothing
+    evidence_scale: PositiveFloat  # credits, after about as many of which evidence is best seen
+    gain: NonNegativeFloat  # of β's logit per standard deviation of evidence beyond chance
+    reads: bool = True  # false: it sees a constant, whatever was played; to see what reading does
+    trusts_evidence: bool = True  # false: its output moves β as it is; to see what waiting does
+
+
+class PretrainedConfig(CreditConfig):
+    """A pretrained LSTM that reads how the training goes, and the credit of earlier βs: ours."""
+
+    lstm: bool  # false: none, in whose place stands the initial β
+    credit_gain: NonNegativeFloat  # of β's logit per unit of z beyond the threshold; 0: no credit
+    credit_threshold: NonNegativeFloat  # of |z|, the sum of the credits in units of its noise
 
 
 class NoBonus(Section):
@@ -49,9 +70,16 @@ class ExponentialBeta(Section):
 
 
 class MetaBeta(Section):
-    """β by meta-adaptation; `initial` is β of the first hundredth of the training."""
+    """β by the paper's meta-adaptation network; `initial` is β before it has learned anything."""
 
     kind: Literal["meta"]
+    initial: float = Field(gt=0, lt=1)
+
+
+class PretrainedBeta(Section):
+    """β by the pretrained LSTM; `initial` is β of the first hundredth of the training."""
+
+    kind: Literal["pretrained"]
     initial: float = Field(gt=0, lt=1)
 
 
@@ -67,4 +95,4 @@ class CustomBeta(Section):
 
 
 BetaRule = ConstantBeta | ExponentialBeta | CustomBeta
-BetaConfig = NoBonus | MetaBeta | BetaRule
+BetaConfig = NoBonus | MetaBeta | PretrainedBeta | BetaRule

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PositiveInt, model_validator
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.beta import BetaConfig, MetaConfig
+from mace_rl.config.beta import BetaConfig, MetaConfig, PretrainedConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.published import COMPUTED, PublishedConfig
 from mace_rl.config.section import Arguments, Section, short_repr
@@ -20,6 +20,7 @@ from mace_rl.config.section import Arguments, Section, short_repr
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
+BETA_SECTIONS = ("meta", "pretrained")  # used only where beta.kind is this
 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -56,7 +57,7 @@ class AgentConfig(Section):
 class RunConfig(AgentConfig):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and None in the
+    `bonus`, `memory`, `novelty`, `meta` and `pretrained` are there in variants that use them and None in the
     others, so that a change of what a variant does not use leaves its runs alone.
     """
 
@@ -65,6 +66,7 @@ class RunConfig(AgentConfig):
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
+    pretrained: PretrainedConfig | None = None
     beta: BetaConfig = Field(discriminator="kind")
 
     @model_validator(mode="before")
@@ -93,7 +95,7 @@ class RunConfig(AgentConfig):
 
     @model_validator(mode="after")
     def _all_that_is_used(self) -> "RunConfig":
-        for section in {*BONUS_SECTIONS, "meta"} - set(unused_sections(self)):
+        for section in {*BONUS_SECTIONS, *BETA_SECTIONS} - set(unused_sections(self)):
             if getattr(self, section) is None:
                 raise ValueError(f"the section {section!r} is missing")
         return self
@@ -125,13 +127,11 @@ def unused_sections(settings: Any) -> dict[str, str]:
         return found
 
     if value("trainer") == "published":
-        return dict.fromkeys((*BONUS_SECTIONS, "meta"), "trainer 'published'")
+        return dict.fromkeys((*BONUS_SECTIONS, *BETA_SECTIONS), "trainer 'published'")
     beta, bonus = value("beta", "kind"), value("bonus", "kind")
     if beta == "none":
-        return dict.fromkeys((*BONUS_SECTIONS, "meta"), "beta.kind 'none'")
-    unused = {}
-    if beta in ("constant", "exponential", "custom"):
-        unused["meta"] = f"beta.kind {beta!r}"
+        return dict.fromkeys((*BONUS_SECTIONS, *BETA_SECTIONS), "beta.kind 'none'")
+    unused = {kind: f"beta.kind {beta!r}" for kind in BETA_SECTIONS if beta and beta != kind}
     if value("bonus", "relevance") is False:
         unused["memory"] = "bonus.relevance false"
     if bonus == "custom":

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from mace_rl.config.beta import BetaRule
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import DEFAULTS, merge, read_yaml
+from mace_rl.config.run import BETA_SECTIONS
 from mace_rl.config.section import Count, Section
 
 
@@ -47,7 +48,7 @@ class CuriosityConfig(Section):
     def _not_meta(cls, beta: Any) -> Any:
         if not isinstance(beta, Mapping):
             return {"kind": "constant", "value": beta}
-        if beta.get("kind") == "meta":
+        if beta.get("kind") in BETA_SECTIONS:
             raise ValueError(
                 "meta-adaptation asks for policy gradients and the budget, which only our trainer "
                 "has: kind should be constant, exponential or custom"

@@ -25,6 +25,7 @@ for name, entry_point, steps, arguments in (
     ("PlantedHelp", PLANTED, 32, {"flag": "right"}),
     ("PlantedHarm", PLANTED, 32, {"flag": "wrong"}),
     ("PlantedNothing", PLANTED, 32, {"flag": "random"}),
+    ("PlantedMixed", f"{PLANTED}Mixed", 32, {}),
 ):
     gymnasium.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=arguments)
 

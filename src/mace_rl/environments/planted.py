@@ -9,6 +9,8 @@ that it learns until the end. The observation also has a flag, and the bonus is 
   says with it, and β should rise.
 - PlantedHarm-v0: it is up after a wrong action. The bonus teaches the opposite, and β should fall.
 - PlantedNothing-v0: it is up at random, and β should stay where it is.
+- PlantedMixed-v0: an episode as in PlantedHelp-v0 and one as in PlantedHarm-v0, in turn. β should
+  rise for the ones and fall for the others, which takes reading what the last one was.
 """
 
 from typing import Any, Literal
@@ -47,3 +49,32 @@ class Planted(gymnasium.Env[np.ndarray, np.int64]):
         coin = self.np_random.random() < 0.5  # drawn in each problem, so that they stay alike
         flag = {"right": right, "wrong": not right, "random": coin}[self.flag]
         return self.observe(flag), reward, False, False, {}
+
+
+class PlantedMixed(Planted):
+    """Two kinds of episodes, in turn: in the first the flag is right, in the second it is wrong.
+
+    A sixth number of the observation says which it is, 1 or 0, and so what the next will be.
+    """
+
+    observation_space = Box(0, 1, (CONTEXTS + 2,), np.float32)
+
+    def __init__(self) -> None:
+        super().__init__("wrong")
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode of the other kind."""
+        self.flag = "wrong" if self.flag == "right" else "right"
+        return super().reset(**kwargs)
+
+    def observe(self, flag: bool) -> np.ndarray:
+        found = super().observe(flag)
+        return np.append(found[:-1], [self.flag == "right", found[-1]]).astype(np.float32)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The kind of the episode."""
+        return {"flag": self.flag}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.flag = state["flag"]

@@ -18,7 +18,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from pydantic import AfterValidator, Field, ValidationError
 
-from mace_rl.config.beta import MetaConfig
+from mace_rl.config.beta import MetaConfig, PretrainedConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.plugins import import_module, load, source_files
 from mace_rl.config.reading import Settings, merge, read_yaml
@@ -43,6 +43,7 @@ class LeftOut(Section):
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
+    pretrained: PretrainedConfig | None = None
 
 
 def _label(text: str) -> str:

@@ -1,0 +1,198 @@
+"""The paper's meta network: gradients, loss, evidence and reading, each computed another way."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from shared import environment_of
+
+from mace_rl.beta.controller import Effect
+from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states
+from mace_rl.beta.meta import Evidence, MetaAdaptation
+from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
+from mace_rl.environments.rollout import Episode
+from mace_rl.factories import beta_controller
+from mace_rl.streams import Streams
+
+
+def invented(rng, steps: int, seen: int = 4, actions: int = 2) -> tuple[Episode, np.ndarray]:
+    observations = rng.standard_normal((steps + 1, seen)).astype(np.float32)
+    chosen = rng.integers(actions, size=steps)
+    rewards = 1 + rng.standard_normal(steps)
+    return Episode(observations, chosen, np.zeros(steps), rewards, True), rng.random(steps)
+
+
+@pytest.fixture
+def make(run_config):
+    """`make(engine, **settings of meta)`: the controller of mace_full in CartPole."""
+
+    def build(engine: str = "compiled", **settings) -> MetaAdaptation:
+        config = run_config("CartPole-v1", "mace_full", 0, engine=engine, meta=settings)
+        return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
+
+    return build
+
+
+@pytest.mark.parametrize("length", [1, 2, 32])
+@pytest.mark.parametrize("units", [4, 16])
+def test_gradient_by_autograd_in_float64(units, length):
+    rng = np.random.default_rng(length)
+    vector = rng.standard_normal(
+        sum(math.prod(s) for s in MetaNetwork.shapes(5, units))
+    ).astype(np.float32)
+    sequence = rng.standard_normal((length, 5)).astype(np.float32)
+    network, found = MetaNetwork.of(vector, 5, units), np.zeros_like(vector)
+    states = lstm_states(sequence, network)
+    add_gradient(sequence, states, network, np.float32(-1.5), MetaNetwork.of(found, 5, units))
+    parts = [torch.from_numpy(part).double().requires_grad_() for part in network]
+    weight_ih, weight_hh, bias, readout, readout_bias = parts
+    hidden = cell = torch.zeros(units, dtype=torch.float64)
+    for x in torch.from_numpy(sequence).double():
+        i, f, o, g = (x @ weight_ih + hidden @ weight_hh + bias).chunk(4)
+        cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
+        hidden = o.sigmoid() * cell.tanh()
+    logit = readout @ hidden + readout_bias[0]
+    assert lstm_logit(sequence, network) == pytest.approx(logit.item(), rel=1e-5, abs=1e-5)
+    (-1.5 * logit).backward()
+    expected = torch.cat([part.grad.ravel() for part in parts]).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
+def test_both_engines_learn_the_same(make):
+    """`torch.nn.LSTM`, autograd and `torch.optim.Adam`; from one to five sequences a credit."""
+    config, rng = make().config, np.random.default_rng(1)
+    ours = CompiledMetaNetwork(config, 7, np.random.default_rng(0))
+    theirs = TorchMetaNetwork(config, 7, np.random.default_rng(0))
+    outputs = []
+    for step in range(80):
+        sequences = [
+            rng.standard_normal((rng.integers(1, 33), 7)).astype(np.float32)
+            for _ in range(1 + step % 5)
+        ]
+        outputs.append(ours.output(sequences[0]))
+        assert outputs[-1] == pytest.approx(theirs.output(sequences[0]), rel=1e-3, abs=1e-5)
+        credit = 1 + rng.standard_normal()
+        for network in (ours, theirs):
+            network.learn(sequences, credit)
+    assert outputs[0] == 0 and max(outputs) > 0.1
+
+
+def test_what_is_read_by_numpy(make):
+    """Means of stretches, standardised by all rows so far, the observations over √4."""
+    controller, rng, rows = make(chunks=8), np.random.default_rng(0), []
+    for steps in (3, 8, 21, 200):
+        episode, bonus = invented(rng, steps)
+        parts = episode.observations[:-1], np.eye(2)[episode.actions], episode.rewards[:, None]
+        each = np.concatenate([*parts, bonus[:, None]], axis=1)
+        own = [part.mean(axis=0) for part in np.split(each, stretches_of(steps))]
+        rows += own
+        std = np.std(rows, axis=0)
+        expected = ((own - np.mean(rows, axis=0)) / np.where(std > 1e-8, std, 1)).clip(-5, 5)
+        expected[:, :4] /= 2
+        found = controller.read(episode, bonus)
+        assert found.dtype == np.float32 and len(found) == min(steps, 8)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def stretches_of(steps: int) -> list[int]:
+    return [k * steps // min(steps, 8) for k in range(1, min(steps, 8))]
+
+
+def test_box_actions_are_read_as_they_are(run_config):
+    config = run_config("Pendulum-v1", "mace_full", 0)
+    controller = beta_controller(config, environment_of("Pendulum-v1"), Streams(0))
+    rng, steps = np.random.default_rng(0), 30
+    actions = rng.standard_normal((steps, 1)).astype(np.float32)
+    seen = rng.standard_normal((steps + 1, 3)).astype(np.float32)
+    episode = Episode(seen, actions, np.zeros(steps), np.zeros(steps), False)
+    found = controller.read(episode, np.zeros(steps))
+    expected = (actions - actions.mean()) / actions.std()
+    np.testing.assert_allclose(found[:, 3:4], expected, rtol=1e-4, atol=1e-5)
+    assert (found[:, 4:] == 0).all()  # what has not varied
+
+
+def test_evidence_by_another_sum(make):
+    """And the bound of Robbins: with a credit that always agrees it is crossed, by chance seldom."""
+    config, rng = make().config, np.random.default_rng(0)
+    evidence, terms, outputs = Evidence(config), [], []
+    for n in range(400):
+        output, credit = rng.standard_normal(), rng.standard_normal()
+        credit += 0.5 * np.sign(output)
+        if outputs:
+            ages = 0.99 ** np.arange(len(outputs))[::-1]
+            size = np.sqrt(np.sum(ages * np.square(outputs)) / ages.sum())
+            terms.append(credit * np.clip(output / size, -1, 1))
+            assert evidence.unit(output) == pytest.approx(np.clip(output / size, -1, 1))
+        evidence.add(credit, output)
+        outputs.append(output)
+    known = np.square(terms).sum() + config.evidence_scale
+    bound = math.sqrt(2 * math.log(1 / 0.3) + math.log(known / config.evidence_scale))
+    beyond = sum(terms) / math.sqrt(known) - bound
+    assert beyond > 0.5 and evidence.beyond_chance == pytest.approx(beyond)
+    assert evidence.logit(9.0) == pytest.approx(6 * beyond)
+    assert evidence.logit(-9.0) == pytest.approx(-6 * beyond)
+    crossed = 0
+    for _ in range(200):
+        evidence = Evidence(config)
+        for output, credit in rng.standard_normal((1500, 2)):
+            evidence.add(credit, output)
+            if evidence.beyond_chance > 0:
+                crossed += 1
+                break
+    assert crossed <= 0.15 * 200  # half of `evidence_chance`: the sum would have to be positive
+
+
+def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
+    """β stays at 0.4 until a credit says more than chance; each credit is of its own rollout.
+
+    Two episodes a rollout, judged by one update: the network that is shown what the controller
+    should learn from, by hand, has the same weights.
+    """
+    settings = {"horizon": 1, "evidence_scale": 1.0, "sequences": 3}
+    controller, rng = make(**settings), np.random.default_rng(3)
+    config, inputs = controller.config, len(controller.normaliser.mean)
+    network = CompiledMetaNetwork(config, inputs, Streams(0)["meta"])
+    evidence, read, waiting, source = Evidence(config), [], None, None
+    assert controller.beta == pytest.approx(0.4)
+    for update in range(120):
+        sources = []
+        for _ in range(5 if update % 3 else 2):
+            expected = 0.4
+            if source is not None:
+                sources.append(source)
+                added = evidence.logit(network.output(source))
+                expected = 1 / (1 + 1.5 * math.exp(-np.clip(added, -5.5, 6.4)))
+            assert controller.beta == pytest.approx(expected, rel=1e-4)
+            controller.next_episode(*invented(rng, int(rng.integers(1, 60))))
+            source = controller.source
+            read.append(source)
+        if len(sources) > 3:
+            sources = [sources[k * len(sources) // 3] for k in range(3)]
+        gradient = np.array([1.0, rng.standard_normal()], np.float32)
+        credit = controller.learn(gradient, 1.0, Effect(np.array([1, 0], np.float32), 1.0))
+        assert (credit is None) == (update == 0)
+        output = np.mean([network.output(sequence) for sequence in sources])
+        if waiting and credit is not None:
+            evidence.add(credit, waiting[1])
+            network.learn(waiting[0], credit)
+        waiting = sources, output
+    assert (network.optimiser.parameters == controller.network.optimiser.parameters).all()
+    assert controller.beta > 0.9  # more of it was always good
+
+
+@pytest.mark.parametrize("settings", [{"reads": False}, {"trusts_evidence": False}])
+def test_without_a_part(make, settings):
+    """What reads nothing is told the same for all; what does not wait moves with its output."""
+    controller, rng = make(horizon=1, **settings), np.random.default_rng(0)
+    betas = []
+    for _ in range(30):
+        controller.next_episode(*invented(rng, 20))
+        effect = Effect(np.array([1, 0], np.float32), 1.0)
+        controller.learn(np.array([1, 0], np.float32), 1.0, effect)
+        betas.append(controller.beta)
+    if "reads" in settings:
+        assert (controller.source == 0).all() and betas == pytest.approx([0.4] * 30)
+    else:
+        output = controller.network.output(controller.source)
+        assert betas[-1] == pytest.approx(1 / (1 + 1.5 * math.exp(-output))) and betas[-1] > 0.41
