@@ -38,9 +38,9 @@ def make(run_config):
 @pytest.mark.parametrize("units", [4, 16])
 def test_gradient_by_autograd_in_float64(units, length):
     rng = np.random.default_rng(length)
-    vector = rng.standard_normal(
-        sum(math.prod(s) for s in MetaNetwork.shapes(5, units))
-    ).astype(np.float32)
+    vector = rng.standard_normal(sum(math.prod(s) for s in MetaNetwork.shapes(5, units))).astype(
+        np.float32
+    )
     sequence = rng.standard_normal((length, 5)).astype(np.float32)
     network, found = MetaNetwork.of(vector, 5, units), np.zeros_like(vector)
     states = lstm_states(sequence, network)
@@ -113,10 +113,10 @@ def test_box_actions_are_read_as_they_are(run_config):
 
 
 def test_evidence_by_another_sum(make):
-    """And the bound of Robbins: with a credit that always agrees it is crossed, by chance seldom."""
+    """And Robbins' bound: a credit that agrees crosses it, chance seldom does."""
     config, rng = make().config, np.random.default_rng(0)
     evidence, terms, outputs = Evidence(config), [], []
-    for n in range(400):
+    for _ in range(400):
         output, credit = rng.standard_normal(), rng.standard_normal()
         credit += 0.5 * np.sign(output)
         if outputs:

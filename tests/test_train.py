@@ -232,7 +232,9 @@ def learned(trainer: Trainer) -> list[bytes]:
 )
 def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, settings):
     judged = {"horizon": 1}
-    changes = {"episodes": 12, "meta": judged, "pretrained": judged, "novelty": SOON} | SETTINGS[settings]
+    changes = {"episodes": 12, "meta": judged, "pretrained": judged, "novelty": SOON} | SETTINGS[
+        settings
+    ]
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
     fixed = finish(run_config(environment, "mace_fixed", 3, beta=zero, **changes))

@@ -9,7 +9,6 @@ where it should: above 0.8 if more β helps, below 0.1 if it harms, from 0.2 to 
 """
 
 import argparse
-import math
 from collections.abc import Callable
 from functools import partial
 from itertools import product
@@ -125,7 +124,8 @@ def main() -> None:
             for seed in range(count)
         ]
         kinds = [
-            np.mean([late(*found["mixed", seed], kind) for seed in range(count)]) for kind in (1, -1)
+            np.mean([late(*found["mixed", seed], kind) for seed in range(count)])
+            for kind in (1, -1)
         ]
         half = slice(CREDITS // 2 - CREDITS // 20, CREDITS // 2)
         before = np.mean([found["turns", seed][0][half].mean() for seed in range(count)])

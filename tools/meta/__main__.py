@@ -21,7 +21,7 @@ from torch import Tensor
 
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import MetaNetwork, lstm_logit, read_network
-from mace_rl.beta.meta import beta_of
+from mace_rl.beta.squash import beta_of
 from tools.meta.lives import GRID, Branch, branches
 
 UNITS, NETWORKS = 4, 4  # small ones whose logits are averaged: as one LSTM in blocks

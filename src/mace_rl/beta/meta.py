@@ -117,9 +117,9 @@ class Evidence(Stateful):
     """Whether the outputs o, before their credits c came, had the right sign.
 
     S = Σ c u, with u the output in units of its usual size, at most 1. Each u is known before its
-    c, so S has mean 0 if β changes nothing, whatever the network has learned from noise. V = Σ (c u)²
-    is its variance. Only what is beyond Robbins' bound (1970), which chance crosses in a share of
-    all trainings however long they are, moves β.
+    c, so S has mean 0 if β changes nothing, whatever the network has learned from noise. Its
+    variance is V = Σ (c u)². Only what is beyond Robbins' bound (1970) moves β: chance crosses that
+    in a given share of all trainings, however long they are.
     """
 
     STATE = ("sum", "variance", "size", "weight")

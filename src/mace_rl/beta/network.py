@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import from_numpy
+from torch import Tensor, from_numpy
 from torch.nn.utils import clip_grad_norm_
 
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states, read_out
@@ -59,58 +59,53 @@ class CompiledMetaNetwork(Stateful):
         learn(steps, ends, f32(credit), f32(self.decay), *where)
 
 
-class TorchMetaNetwork(torch.nn.Module):
+class TorchMetaNetwork(Stateful):
     """A `LearningNetwork` of `torch.nn.LSTM`, whose second bias stays 0."""
 
+    STATE = ("lstm", "readout", "optimiser")
+
     def __init__(self, config: MetaConfig, inputs: int, generator: np.random.Generator) -> None:
-        super().__init__()
         units, self.decay = config.hidden_units, config.output_decay
         self.largest = config.max_gradient_norm
         weights = MetaNetwork.of(initial_weights(inputs, units, generator), inputs, units)
         plain: Any = {"device": "cpu", "dtype": torch.float32}
         before = torch.get_rng_state()  # new layers draw weights, which are replaced
-        self.lstm, self.readout = (
-            torch.nn.LSTM(inputs, units, **plain),
-            torch.nn.Linear(units, 1, **plain),
-        )
+        self.lstm = torch.nn.LSTM(inputs, units, **plain)
+        self.readout = torch.nn.Linear(units, 1, **plain)
         torch.set_rng_state(before)
         # PyTorch's order of gates: input, forget, candidate, output.
         order = np.concatenate([np.arange(units) + k * units for k in (0, 1, 3, 2)])
+        values = {
+            "weight_ih_l0": weights.weight_ih[:, order].T,
+            "weight_hh_l0": weights.weight_hh[:, order].T,
+            "bias_ih_l0": weights.bias[order],
+            "bias_hh_l0": np.zeros(4 * units, np.float32),
+        }
+        self.lstm.load_state_dict({key: from_numpy(value) for key, value in values.items()})
+        self.learnt = [part for name, part in self.lstm.named_parameters() if name != "bias_hh_l0"]
+        self.learnt += self.readout.parameters()
         with torch.no_grad():
-            self.lstm.weight_ih_l0.copy_(from_numpy(weights.weight_ih[:, order].T))
-            self.lstm.weight_hh_l0.copy_(from_numpy(weights.weight_hh[:, order].T))
-            self.lstm.bias_ih_l0.copy_(from_numpy(weights.bias[order]))
-            self.lstm.bias_hh_l0.zero_().requires_grad_(False)
-            self.readout.weight.zero_()
-            self.readout.bias.zero_()
-        self.learnt = [part for part in self.parameters() if part.requires_grad]
+            for part in self.readout.parameters():
+                part.zero_()
         self.optimiser = torch.optim.Adam(self.learnt, config.learning_rate, eps=EPSILON)
 
-    def forward(self, sequence: np.ndarray) -> torch.Tensor:
+    def outputs(self, sequence: np.ndarray) -> Tensor:
         """o, [1]."""
         hidden, _ = self.lstm(from_numpy(sequence))
-        return self.readout(hidden[-1])
+        answer: Tensor = self.readout(hidden[-1])
+        return answer
 
     def output(self, sequence: np.ndarray) -> float:
         with torch.no_grad():
-            return self(sequence).item()
+            return self.outputs(sequence).item()
 
     def learn(self, sequences: list[np.ndarray], credit: float) -> None:
-        outputs = torch.cat([self(sequence) for sequence in sequences])
+        outputs = torch.cat([self.outputs(sequence) for sequence in sequences])
         loss = (-credit * outputs + self.decay / 2 * outputs.square()).mean()
         self.optimiser.zero_grad()
         loss.backward()
         clip_grad_norm_(self.learnt, self.largest)
         self.optimiser.step()
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Weights and the optimiser's state."""
-        return {"weights": super().state_dict(*args, **kwargs), "adam": self.optimiser.state_dict()}
-
-    def load_state_dict(self, state: Any, *args: Any, **kwargs: Any) -> Any:
-        """Restore what `state_dict` returned."""
-        self.optimiser.load_state_dict(state["adam"])
-        return super().load_state_dict(state["weights"], *args, **kwargs)
 
 
 @kernel

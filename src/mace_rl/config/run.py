@@ -57,8 +57,8 @@ class AgentConfig(Section):
 class RunConfig(AgentConfig):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `bonus`, `memory`, `novelty`, `meta` and `pretrained` are there in variants that use them and None in the
-    others, so that a change of what a variant does not use leaves its runs alone.
+    `bonus`, `memory`, `novelty`, `meta` and `pretrained` are there in variants that use them and
+    None in the others, so that a change of what a variant does not use leaves its runs alone.
     """
 
     model_config = Section.model_config

@@ -75,7 +75,10 @@ class CompiledMLP:
         count = sum((inputs + 1) * padded(outputs) for outputs, inputs in shapes)
         self.parameters = np.zeros(count, np.float32)
         # For one input and what the layers make of it, while somebody acts.
-        self.scratch = np.empty((1, shapes[0][1]), np.float32), kernels.activation_buffer(1, self.sizes)
+        self.scratch = (
+            np.empty((1, shapes[0][1]), np.float32),
+            kernels.activation_buffer(1, self.sizes),
+        )
         self.load_module_state(module.state_dict())
 
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
