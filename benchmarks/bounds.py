@@ -18,6 +18,7 @@ from numba import njit
 from mace_rl.agent import compiled_learner
 from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.network import CompiledMLP
+from mace_rl.numerics.network_kernels import FEW
 from mace_rl.numerics.products import dot, product
 
 BOUNDS = ("arithmetic", "traffic")
@@ -37,7 +38,10 @@ class Work:
         layers = [(int(ins), math.ceil(outs / 16) * 16) for ins, outs in pairwise(sizes)]
         one = sum(2 * ins * outs for ins, outs in layers)
         hidden = sum(2 * int(ins) * int(outs) for ins, outs in pairwise(sizes[1:]))
-        self.operations += rows * (forward * one + backward * (one + hidden))
+        # The weights' gradient of a narrow last layer is computed along its inputs.
+        ins, outs = layers[-1]
+        unpadded = 2 * ins * (outs - int(sizes[-1])) if sizes[-1] <= FEW else 0
+        self.operations += rows * (forward * one + backward * (one + hidden - unpadded))
         if rows > 1:
             blocks = math.ceil(rows / compiled_learner.BLOCK)
             parameters = sum((ins + 1) * outs for ins, outs in layers)
@@ -76,7 +80,8 @@ class Work:
             "policy_gradients",
             lambda found, seen, *_: self.network(sizes, len(seen), 1, len(found)),
         )
-        counted(CompiledMLP, "forward", lambda _, own, x: self.network(own.sizes, len(x)))
+        for name in ("forward", "outputs"):
+            counted(CompiledMLP, name, lambda _, own, x: self.network(own.sizes, len(x)))
         counted(
             CompiledMLP,
             "backward",
