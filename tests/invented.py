@@ -27,16 +27,13 @@ CONFIG = check(MetricsConfig, SETTINGS, "test")
 
 ROOT = Path(__file__).parents[1]
 STUDY = read_study([ROOT / "config.yaml"])
-CLAIMS = parse_claims(ROOT / "reference" / "confirmation" / "claims.yaml")  # by the first rule
-FAMILIES = CLAIMS.families.items()
-PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict([one])}) for one in FAMILIES)
+CLAIMS = parse_claims(ROOT / STUDY.claims)
+FIRST, _, *OTHERS = CLAIMS.families.items()  # the second has metrics of its own
+PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict(own)}) for own in ([FIRST], OTHERS))
 LITERAL, ROBUST = CLAIMS.ways
-by_rule = PAPERS.model_dump() | {"rule": 2}
-by_rule["families"]["the paper's claims"]["words"]["no_room"] = "could not be asked"
-BY_SIZE = type(PAPERS).model_validate(by_rule)  # the same by the second rule
-WORLDS = parse_claims(ROOT / STUDY.claims)  # with questions of three variants, by the second rule
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
-QUESTIONED = read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"]).metrics
+ASKED = [ROOT / "config" / f"{name}.yaml" for name in ("questions", "controls", "planted")]
+QUESTIONED = read_study([ROOT / "config.yaml", *ASKED]).metrics
 FEW = {"bootstrap_repetitions": 1000}
 QUESTIONED, QUICK = (metrics.model_copy(update=FEW) for metrics in (QUESTIONED, STUDY.metrics))
 
@@ -135,7 +132,7 @@ def table_for_claims(seeds: int, advantage: dict[str, float], noise: float) -> p
 def table_for_questions(seeds: int, **better: float) -> pd.DataFrame:
     """metrics.csv with mean returns of all that our questions need; some variants are better."""
     draws = np.random.default_rng(4)
-    parts = [part for _, part in parts_of(*QUESTIONS.families.values())]
+    parts = [part for own in QUESTIONS.families.values() for _, part in parts_of(own)]
     environments = dict.fromkeys(env for part in parts for env in part.environments)
     variants = dict.fromkeys(name for part in parts for name in (part.variant, *part.over))
     cells = itertools.product(environments, variants)

@@ -1,6 +1,6 @@
 """The kept verdicts, and the table as a draw, once more by code written from the pages alone.
 
-docs/metrics.md ("The second rule") and docs/worlds-protocol.md say what is computed here, config/
+docs/metrics.md ("The rule") and docs/worlds-protocol.md say what is computed here, config/
 which parts and settings. What made the tables is not imported: a mistake would be needed twice.
 """
 
@@ -23,11 +23,7 @@ TABLES = ROOT / "reference" / "tables"
 STUDIES = yaml.safe_load((ROOT / "reference" / "studies.yaml").read_text(encoding="utf-8"))
 CLAIMS = yaml.safe_load((ROOT / "config" / "claims.yaml").read_text(encoding="utf-8"))
 PAPER = CLAIMS["table1"]["values"]
-JUDGED = [
-    name
-    for name, study in STUDIES.items()
-    if study["configuration"] == "config" and "claims.json" in study["outputs"]
-]
+JUDGED = [name for name, study in STUDIES.items() if "claims.json" in study["outputs"]]
 DRAWN = pd.read_csv(TABLES / "worlds" / "draws.csv").set_index("world")
 RULES = {  # of both metrics
     rule: rule.split(" / ") for rule in DRAWN["rule"].unique()

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import BY_SIZE, CLAIMS, ENVIRONMENTS, ROBUST, STUDY, VARIANTS, table_for_claims
+from invented import CLAIMS, ENVIRONMENTS, PAPERS, ROBUST, STUDY, VARIANTS, table_for_claims
 from matplotlib.figure import Figure
 from shared import illegible, message
 
@@ -106,7 +106,7 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     for world, better in advantages.items():
         advantage = {"ppo": 0.0, "mace_fixed": 0.0, "mace_full": better}
         table = table_for_claims(12, advantage, noise=0.02)
-        ledgers[world] = ledger(table, settings, BY_SIZE)
+        ledgers[world] = ledger(table, settings, PAPERS)
         folder = tmp_path / world
         folder.mkdir()
         same = {"sample_efficiency_public_code": table["sample_efficiency"]}  # both are drawn

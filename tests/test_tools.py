@@ -17,29 +17,8 @@ from benchmarks import bounds, breakdown, guard, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
 from mace_rl.study.config import read_study
-from tools import kept_runs, memory_picture, random_return, tables
+from tools import kept_runs, random_return, tables
 from tools.deposit import DepositError, deposit
-
-
-def test_memory_is_pictured_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_picture, "AFTER", (1, 6))
-    found, first = memory_picture.follow()
-    last = found[max(found)]
-    visits = 10 ** last["visits, log"] - 1
-    # Nothing was won yet: all is relevant now, and of what is remembered nothing was then.
-    assert first == 0
-    assert (last["relevance"] == 1).all()
-    assert last["relevance, confirmation"][0] == 0 and visits[0] > 1
-    np.testing.assert_allclose(last["bonus"], 1 / (1 + visits))
-    assert len(memory_picture.draw(found, first).axes) == 4 * len(found) + 4
-
-
-def test_the_confirmations_relevance_is_from_the_worst_to_the_best_return() -> None:
-    similarity, recalled = np.array([1, 1, 1, 0.5, 0.5]), np.array([-1, 0, 1, 0, -1])
-    found = memory_picture.confirmations(similarity, recalled, np.array([-1, 0.2, 1]))
-    assert found.tolist() == [0, 0.5, 1, 0.75, 0.5]
-    alike = memory_picture.confirmations(similarity, recalled, np.array([0, 0.05]))
-    assert alike.tolist() == [0, 0, 0, 0.5, 0.5]
 
 
 def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
@@ -77,9 +56,9 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     for seed in (0, 1):
         folder = tmp_path / f"results/runs/CartPole-v1/ppo/seed{seed}"
         run.run(study.run_config("CartPole-v1", "ppo", seed), folder)
-    kept_runs.pack(tmp_path / "results", tmp_path / "reference/study")
-    wanted = {"configuration": "config", "configfiles": ["config/small.yaml"], "config": []}
-    wanted |= {"runs": "reference/study", "outputs": ["metrics.csv", "figure1.png"]}
+    kept_runs.pack(tmp_path / "results", tmp_path / "reference/small")
+    wanted = {"configfiles": ["config/small.yaml"], "config": []}
+    wanted |= {"runs": "reference/small", "outputs": ["metrics.csv", "figure1.png"]}
     studies, kept = tmp_path / "reference/studies.yaml", tmp_path / "reference/tables/small"
     studies.write_text(yaml.safe_dump({"small": wanted}))
 
@@ -121,10 +100,10 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     assert tabulate("--report", "small")[0] == "results/tables/small/report.html\n"
     assert "<!DOCTYPE html>" in (tmp_path / "results/tables/small/report.html").read_text()
     assert "--report is 'none', but should be one of bad, small" in tabulate("--report", "none")[1]
-    [archive] = (tmp_path / "reference/study").rglob("*.tar.xz")
+    [archive] = (tmp_path / "reference/small").rglob("*.tar.xz")
     archive.write_bytes(archive.read_bytes()[:1000])
     assert tabulate("--report", "small")[1].startswith(
-        "tables: reference/study/CartPole-v1/ppo.tar"
+        "tables: reference/small/CartPole-v1/ppo.tar"
     )
 
 

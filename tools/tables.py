@@ -3,45 +3,35 @@
     python -m tools.tables [--check]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY and by the
-configuration that the study had, the outputs that reference/studies.yaml names, and README.md:
-tables.md with the pictures that are among these, and for the confirmation's studies the verdicts of
-the first study beside theirs. What the worlds of docs/worlds-protocol.md say together comes into
-results/tables/worlds. Pictures are reduced to 256 colours. All is compared with reference/tables.
-New files are kept there, and README.md, which only shows the others, is renewed; with --check both
-are mistakes. With --report only the page of one study is made, and not compared.
+The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY, the outputs that
+reference/studies.yaml names, and README.md: tables.md with the pictures that are among these. What
+the worlds of docs/worlds-protocol.md say together comes into results/tables/worlds. Pictures are
+reduced to 256 colours. All is compared with reference/tables. New files are kept there, and
+README.md, which only shows the others, is renewed; with --check both are mistakes. With --report
+only the page of one study is made, and not compared.
 """
 
 import argparse
-import json
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from PIL import Image
 
 from mace_rl.config.reading import read_yaml
-from mace_rl.study.compare.ledger import Answer, answer_of, read_ledger
-from mace_rl.study.show.markdown import markdown
-from mace_rl.study.show.tables import parts
 from tools import kept_runs, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 CORES = len(os.sched_getaffinity(0))
 
 STUDIES = Path("reference/studies.yaml")
-CONFIRMATION, ITS_COMMIT = "reference/study", "0252ad2"
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
-FIRST = Path("reference/measured/first_study.json")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
-ROBUST = "robust"  # the way to measure that is compared
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
@@ -53,12 +43,12 @@ RULES = (
 def make(name: str, study: dict[str, Any]) -> None:
     """Make the `outputs` of one study; `ValueError` with what Snakemake says if it cannot.
 
-    Where it is started `config/` is the study's own, and the pages name the command as it was.
+    Where it is started `config/` is the project's, so that the pages name the command.
     """
     folder = ROOT / MADE / name
     folder.mkdir(parents=True)
     (folder / "runs").symlink_to(ROOT / MADE / study["runs"] / "runs", target_is_directory=True)
-    (folder / "config").symlink_to(ROOT / study["configuration"], target_is_directory=True)
+    (folder / "config").symlink_to(ROOT / "config", target_is_directory=True)
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
     command += ["--cores", str(CORES), "--allowed-rules", *RULES]
     command += ["--configfile", *study["configfiles"]]
@@ -77,38 +67,12 @@ def make_all(studies: dict[str, Any]) -> None:
         list(pool.map(make, studies, studies.values()))
 
 
-def write_readme(name: str, study: dict[str, Any], outputs: list[str]) -> None:
+def write_readme(name: str, outputs: list[str]) -> None:
     """README.md of a study, beside what is kept of it: its name, its tables, these pictures."""
     text = (MADE / name / TABLES).read_text(encoding="utf-8")
     text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
     text = re.sub("^# .*", f"# {name}", text)
-    if study["runs"] == CONFIRMATION:  # today the command would train another method
-        text = text.replace("`: ", f"` at commit {ITS_COMMIT}: ", 1)
-    ledger = MADE / name / "claims.json"
-    if ledger.exists() and study["runs"] == CONFIRMATION:
-        first = [answer_of(record) for record in json.loads(FIRST.read_bytes())]
-        text += beside_the_first(first, read_ledger(ledger))
     (MADE / name / README).write_text(text, encoding="utf-8")
-
-
-def beside_the_first(first: Sequence[Answer], second: Sequence[Answer]) -> str:
-    """The verdicts and the parts of the second study, robust, beside those that the first has."""
-    verdicts = {answer.claim: answer.ways[ROBUST].verdict for answer in first}
-    rows = [
-        [one.claim, one.statement, verdicts.get(one.claim, ""), one.ways[ROBUST].verdict]
-        for one in second
-    ]
-    said = pd.DataFrame(rows, columns=["", "statement", "first", "this"])
-    what = ["", "environment", "metric", "over"]
-    shown = [*what, "n", "difference", "outcome"]
-    frames = [parts(claims, ROBUST, {}).iloc[:, [*range(6), -1]] for claims in (first, second)]
-    before, now = (frame.set_axis(shown, axis=1) for frame in frames)
-    both = now.merge(before, "left", on=what, suffixes=("", " (first)")).fillna("")
-    return (
-        "\n## The first study and this one\n\nBoth by the robust metrics and the same rule. The"
-        " first study's runs, of seeds below 20, are in commit 3c9fd6f. It had no NoisyMountainCar"
-        f" and no NoisyDeepSea10.\n\n{markdown(said)}\n{markdown(both)}"
-    )
 
 
 def reduce_colours(picture: Path) -> None:
@@ -164,7 +128,7 @@ def main() -> None:
         print(MADE / only / PAGE)
         return
     for name in outputs:
-        write_readme(name, studies[name], outputs[name])
+        write_readme(name, outputs[name])
         outputs[name] = [*outputs[name], README]
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together

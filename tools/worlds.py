@@ -31,7 +31,7 @@ DECIDES = "robust"  # the way to measure that is counted and pictured
 COMMAND = "`python -m tools.worlds`"
 # The metrics that the protocol names; the first is not the public code's rule, as its words ask.
 AS_NAMED = ("sample_efficiency", "convergence_steps_public_code")
-RULE = "[second rule](../../../docs/metrics.md#the-second-rule)"
+RULE = "[rule](../../../docs/metrics.md#the-rule)"
 
 
 def make(folder: Path) -> list[str]:

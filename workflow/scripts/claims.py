@@ -1,4 +1,4 @@
-"""The ledger: what of the paper holds, and what of our own questions (docs/protocol.md)."""
+"""The ledger: what of the paper holds, and what of our own questions (docs/metrics.md)."""
 
 from pathlib import Path
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -124,7 +124,7 @@ class WordsConfig(Section):
     reversed: str
     absent: str
     open: str
-    no_room: str | None = None  # by the second rule, and by no other
+    no_room: str
 
 
 class FamilyConfig(Section):
@@ -147,7 +147,6 @@ class ClaimsConfig(Section):
     table1: Table1Config
     table2: Table2Config = Field(default=Table2Config())
     ways: dict[str, str]  # to measure a claim, each with what the report says of it
-    rule: Literal[1, 2] = 1  # the protocol's, or direction and size apart (docs/metrics.md)
     families: dict[str, FamilyConfig] = Field(default={})
 
     def lacking(
@@ -266,11 +265,6 @@ def _check_form(claims: ClaimsConfig) -> None:
                     f" table1.variants, and no other, should have {len(table1.metrics)} numbers"
                 )
     for title, family in claims.families.items():
-        if (claims.rule == 2) != (family.words.no_room is not None):
-            raise ConfigError(
-                f"families.{title}.words.no_room is {family.words.no_room!r}, but should be a word"
-                f" by the second rule and not be there by the first; rule is {claims.rule}"
-            )
         for name, claim in family.claims.items():
             key = f"families.{title}.claims.{name}"
             if name in seen:

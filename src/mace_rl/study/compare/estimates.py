@@ -1,4 +1,4 @@
-"""What the seeds say of one part of a claim, whatever the rule: estimates, intervals and tests."""
+"""What the seeds say of one part of a claim: estimates, intervals and tests."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -31,13 +31,7 @@ class Finding:
     p_equivalent: float  # that the difference is not smaller than what is worth mentioning
     p_holm: float = math.nan
     p_equivalent_holm: float = math.nan
-    outcome: str = ""  # shown, reversed, absent or open
-
-
-@dataclass(frozen=True)
-class SizedFinding(Finding):
-    """The same by the second rule, direction and size apart; `outcome` may be no_room, too."""
-
+    outcome: str = ""  # shown, reversed, no_room, absent or open
     size: str = ""  # worth mentioning, small or open
     room: float = math.nan  # how much better than the baseline a run could be at most
     predicted_low: float = math.nan  # of where a mean of ours may lie if the paper's one run each
@@ -100,5 +94,4 @@ def _judgement(outcome: str, verdict: str, parts: list[dict[str, Any]]) -> Judge
         part["environments"] = tuple(part["environments"])
         missing = [key for key, value in part.items() if value is None and key != "baseline"]
         part |= dict.fromkeys(missing, math.nan)
-    kind = SizedFinding if "size" in parts[0] else Finding
-    return Judgement(outcome, verdict, [kind(**part) for part in parts])
+    return Judgement(outcome, verdict, [Finding(**part) for part in parts])

@@ -1,20 +1,28 @@
-"""Do claims hold? By the first rule (docs/protocol.md) or the second (`direction_and_size`)."""
+"""Do claims hold? By the rule of docs/metrics.md: direction and size apart."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from mace_rl.study.claims_config import FEWEST_SEEDS, ClaimConfig, ClaimsConfig, Part, Table1Config
-from mace_rl.study.compare import direction_and_size
-from mace_rl.study.compare.estimates import LEVEL, WORTH_MENTIONING, find, pairs_of
+from mace_rl.study.compare.estimates import (
+    CONFIDENCE,
+    LEVEL,
+    WORTH_MENTIONING,
+    Pair,
+    find,
+    pairs_of,
+)
 from mace_rl.study.compare.ledger import Answer, Finding, Judgement
 from mace_rl.study.compare.statistics import holm
 from mace_rl.study.measure.metrics import metric_units
 from mace_rl.study.metrics_config import MetricsConfig
+
+OF_BASELINE = 0.1  # of the episodes that the baseline itself needs: less is not worth mentioning
 
 
 def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -> list[Answer]:
@@ -41,7 +49,7 @@ def _answers(
             for name, claim in family.claims.items()
         }
         every = list(chain.from_iterable(parts.values()))
-        findings = iter(judge(every, table, settings, claims.rule))
+        findings = iter(judge(every, table, settings))
         for name, own in parts.items():
             found = [next(findings) for _ in own]
             outcomes = [finding.outcome for finding in found]
@@ -54,12 +62,9 @@ def _answers(
         yield Answer(title, name, claim.statement, paper, judged[name])
 
 
-def judge(
-    parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig, rule: int
-) -> list[Any]:
+def judge(parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig) -> list[Finding]:
     """What each part came out as; p values of either kind are corrected for all parts."""
-    find_by_rule, decided = RULES[rule]
-    findings = [find_by_rule(part, table, settings) for part in parts]
+    findings = [find_sized(part, table, settings) for part in parts]
     different = _corrected([finding.p_value for finding in findings])
     equivalent = _corrected([finding.p_equivalent for finding in findings])
     return [
@@ -78,32 +83,70 @@ def verdict(outcomes: Sequence[str]) -> str:
     return "absent" if found & {"reversed", "absent"} else "open"
 
 
-def outcome(finding: Finding) -> str:
-    """Of one part, whose p values are corrected."""
-    if finding.seeds >= FEWEST_SEEDS and finding.p_equivalent_holm < LEVEL:
-        return "absent"
-    if finding.seeds >= FEWEST_SEEDS and finding.p_holm < LEVEL:
-        return "shown" if finding.difference > 0 else "reversed"
-    return "open"
+def find_sized(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
+    """What is found of one part, before p values are corrected."""
+    pairs = pairs_of(part, table, settings)
+    found = find(part, pairs, float(np.mean([_margin(pair) for pair in pairs])), settings)
+    chance = by_chance(pairs[0].variant - pairs[0].baseline)  # the paper has one environment
+    return replace(
+        found,
+        room=float(np.mean([pair.best - pair.baseline.mean() for pair in pairs])),
+        predicted_low=found.in_paper - chance,
+        predicted_high=found.in_paper + chance,
+    )
+
+
+def decided(part: Finding) -> Finding:
+    """A part whose p values are corrected, with what the rule says of it."""
+    if part.seeds < FEWEST_SEEDS:
+        return replace(part, outcome="open", size="open")
+    size = "small" if max(-part.low, part.high) < part.worth_mentioning else "open"
+    if max(part.low, -part.high) > part.worth_mentioning:
+        size = "worth mentioning"
+    outcome = "open"
+    if part.p_holm < LEVEL:
+        outcome = "shown" if part.difference > 0 else "reversed"
+    elif not part.has_room:
+        outcome = "no_room"
+    elif size == "small" and part.p_equivalent_holm < LEVEL:
+        outcome = "absent"
+    return replace(part, outcome=outcome, size=size, replication=_replication(part))
+
+
+def by_chance(differences: np.ndarray) -> float:
+    """Half a prediction interval for the difference of one run each; NaN with one seed.
+
+    Such a difference varies by our σ², our mean of n by σ² / n (Spence and Stanley 2016; Patil,
+    Peng and Leek 2016).
+    """
+    seeds = len(differences)
+    if seeds == 1:
+        return np.nan
+    quantile = scipy.special.stdtrit(seeds - 1, (1 + CONFIDENCE) / 2)
+    return float(quantile * np.std(differences, ddof=1) * np.sqrt(1 + 1 / seeds))
+
+
+def _margin(pair: Pair) -> float:
+    """The smallest difference worth mentioning."""
+    if pair.resolution:
+        return max(-OF_BASELINE * pair.baseline.mean(), pair.resolution)
+    return WORTH_MENTIONING * pair.everything
+
+
+def _replication(part: Finding) -> str:
+    """Whether the paper's difference goes with ours; empty where it has none."""
+    if np.isnan(part.in_paper):
+        return ""
+    if part.low <= part.in_paper <= part.high:
+        return "agrees"
+    near = part.predicted_low <= part.difference <= part.predicted_high
+    return "within one seed's chance" if near else "disagrees"
 
 
 def _corrected(p_values: Sequence[float]) -> list[float]:
     """Holm's p values; NaN where there was none, because of one seed, which counts as 1."""
     adjusted = holm([1.0 if np.isnan(p) else p for p in p_values])
     return [p if np.isnan(p) else float(q) for p, q in zip(p_values, adjusted, strict=True)]
-
-
-def _find(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:
-    """Estimates and tests of one part, with the protocol's margin."""
-    pairs = pairs_of(part, table, settings)
-    return find(part, pairs, WORTH_MENTIONING * pairs[0].everything, settings)
-
-
-# What a rule finds of a part, and what it makes of that when all p values are corrected.
-RULES: dict[int, tuple[Callable[..., Any], Callable[..., Any]]] = {
-    1: (_find, lambda finding: replace(finding, outcome=outcome(finding))),
-    2: (direction_and_size.find_sized, direction_and_size.decided),
-}
 
 
 def _in_paper(claim: ClaimConfig, table1: Table1Config, settings: MetricsConfig) -> str:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from mace_rl.study.claims_config import ClaimsConfig
 from mace_rl.study.compare.aggregate import SCORED
-from mace_rl.study.compare.estimates import CONFIDENCE, WORTH_MENTIONING
-from mace_rl.study.compare.ledger import Answer, Finding, SizedFinding
+from mace_rl.study.compare.estimates import CONFIDENCE
+from mace_rl.study.compare.ledger import Answer, Finding
 from mace_rl.study.compare.readings import PAPER, in_order, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.measure.metrics import metric_labels
@@ -28,12 +28,11 @@ OUTCOMES = {
     "open": ("#767676", "open"),
     "absent": ("#0173b2", "absent: no effect worth mentioning"),
     "reversed": ("#d55e00", "reversed"),
+    "no_room": ("#cc78bc", "no room for an effect worth mentioning"),
 }
-NO_ROOM = {"no_room": ("#cc78bc", "no room for an effect worth mentioning")}  # the second rule's
 INK = "#262626"  # as seaborn draws axes
 LINE = 0.6  # the height of a line of words, where a part has 1
 SMALL_LETTERS = 141  # of the smallest words, as many as stand side by side in a picture
-UNIT = f"{100 * WORTH_MENTIONING:g} % of the scale"
 
 
 class Source(NamedTuple):
@@ -154,7 +153,7 @@ def forest(source: Source) -> pd.DataFrame:
     Columns: measured (in which way), claim, statement, verdict and answer (of the claim, in its
     own words and in those of parts), part (what tells it from the claim's others), metric, seeds,
     difference, low, high, paper (the same in the paper's Table 1; NaN where that has none), outcome
-    (of the part), by the second rule its size. More is in the claim's favour.
+    and size (of the part). More is in the claim's favour.
     """
     rows = []
     for answer, (how, judged) in ((one, way) for one in source.answers for way in one.ways.items()):
@@ -163,13 +162,12 @@ def forest(source: Source) -> pd.DataFrame:
             values = part.difference, part.low, part.high, part.in_paper
             scaled = [value / part.worth_mentioning for value in values]
             measured = (_what(part, judged.parts, source), part.metric, part.seeds)
-            size = [part.size] if isinstance(part, SizedFinding) else []
-            rows.append((*common, *measured, *scaled, part.outcome, *size))
+            rows.append((*common, *measured, *scaled, part.outcome, part.size))
     ways = list(dict.fromkeys(how for how, *_ in rows))
     rows.sort(key=lambda row: ways.index(row[0]))
     columns = ["measured", "claim", "statement", "verdict", "answer", "part", "metric", "seeds"]
     columns += ["difference", "low", "high", "paper", "outcome", "size"]
-    return pd.DataFrame(rows, columns=columns[: len(rows[0])])
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
@@ -193,8 +191,6 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
     small: dict[str, Any] = {"fontsize": "x-small"}
     hollow: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 4}
     hollow |= {"label": "the paper's Table 1", "zorder": 1.5}
-    by_size = "size" in table
-    outcomes, unit = (OUTCOMES | NO_ROOM, "the margin") if by_size else (OUTCOMES, UNIT)
     ends = table[["low", "high", "difference", "paper"]].abs()
     reach = 1.1 * max(1, np.nanmax(ends.to_numpy()))
     ways = table["measured"].unique()
@@ -205,7 +201,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
         figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
         for how, axes in zip(ways, panels, strict=True):
             own = table[table["measured"] == how]
-            for outcome, (colour, label) in outcomes.items():
+            for outcome, (colour, label) in OUTCOMES.items():
                 parts = own[own["outcome"] == outcome]
                 bars = parts["place"], parts["low"], parts["high"]
                 axes.hlines(*bars, color=colour, linewidth=1.2)
@@ -217,10 +213,10 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
-            axes.set_xlabel(f"Difference in favour of what is said\n(1: {unit})")
+            axes.set_xlabel("Difference in favour of what is said\n(1: the margin)")
             for name, claim in own.groupby("claim", sort=False):
                 (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
-                top, colour = blocks[str(name)][0] + 0.2, outcomes[answer][0]
+                top, colour = blocks[str(name)][0] + 0.2, OUTCOMES[answer][0]
                 axes.text(reach, top, verdict, color=colour, ha="right", va="top", **small)
         for shade, (name, (top, end)) in enumerate(blocks.items()):
             for panel in (names, *panels):
@@ -232,8 +228,7 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
         for panel in (names, *panels):
             panel.set_ylim(count, 0)
         level = f"{100 * CONFIDENCE:g} % interval"
-        dashed = unit if by_size else f"{unit}, the margin"
-        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: {dashed}.")
+        legend(figure, f"Dot: mean over seeds. Bar: its {level}. Dashed: the margin.")
     return figure
 
 

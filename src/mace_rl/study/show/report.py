@@ -71,7 +71,7 @@ def page(
         families=sections.by_family(answers),
         counted=sections.counted,
         parts=lambda answer, how: tables.parts([answer], how, names).iloc[:, 1:],
-        parts_note=sections.PARTS_BY_RULE[claims.rule],
+        parts_note=sections.PARTS,
         fewest=FEWEST_SEEDS,
         seeds=from_to(metrics.groupby(["env", "variant"]).size()),
         runs=len(records),

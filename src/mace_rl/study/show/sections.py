@@ -25,12 +25,9 @@ PARTS = (
     " parts. *P*: that a run of the first is better. *Margin*: what is worth mentioning."
     f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
     " correction."
+    " *Room*: how much better than the second any run could be, or is. *One seed*: where our"
+    " difference would lie if the paper's, of one run each, differed from it by chance."
 )
-PARTS_BY_RULE = {
-    1: PARTS,
-    2: f"{PARTS} *Room*: how much better than the second any run could be, or is. *One seed*: where"
-    " our difference would lie if the paper's, of one run each, differed from it by chance.",
-}
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
 
@@ -68,7 +65,7 @@ def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
 def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
     """How many claims of one family have which verdict, in words."""
     counts = Counter(answer.ways[how].verdict for answer in answers)
-    words = claims.families[answers[0].family].words.model_dump(exclude_none=True).values()
+    words = claims.families[answers[0].family].words.model_dump().values()
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
 
 
@@ -76,8 +73,7 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
     """Family by family the verdicts, and then the parts in each way to measure them."""
     for title, own in by_family(answers).items():
         verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
-        page = "metrics" if claims.rule == 2 else "protocol"
-        note = f"Of {len(own)}, {verdicts}. The rule: docs/{page}.md."
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/metrics.md."
         ways = [way for answer in own for way in answer.ways.values()]
         seeds = min(part.seeds for way in ways for part in way.parts)
         if seeds < FEWEST_SEEDS:
@@ -85,7 +81,7 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
         yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
         for how in own[0].ways:
             frame = tables.parts(own, how, {})
-            yield Section(f"Part by part: {how}", PARTS_BY_RULE[claims.rule], frame, level=3)
+            yield Section(f"Part by part: {how}", PARTS, frame, level=3)
 
 
 def of_runs(

@@ -10,7 +10,7 @@ import pandas as pd
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_rl.runs.progress import duration
 from mace_rl.study.claims_config import Table1Config, Table2Config
-from mace_rl.study.compare.ledger import Answer, SizedFinding
+from mace_rl.study.compare.ledger import Answer, Finding
 from mace_rl.study.compare.readings import in_order, ranked, title
 from mace_rl.study.compare.statistics import interval
 from mace_rl.study.compare.summary import digits_by_metric
@@ -220,15 +220,15 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
         row += [_estimate(vars(part), "difference", digits, ends="")]
         row += [_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)]
         row += [_estimate(vars(part), "probability", 2), *(_number(one, digits) for one in sizes)]
-        row += _by_size(part, digits) if isinstance(part, SizedFinding) else [part.outcome]
+        row += _by_size(part, digits)
         rows.append(row)
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
-    return pd.DataFrame(rows, columns=[*heads[: len(rows[0]) - 1], ""])
+    return pd.DataFrame(rows, columns=[*heads, ""])
 
 
-def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
-    """What the second rule says of a part."""
+def _by_size(part: Finding, digits: int) -> list[str | Cell]:
+    """Room, replication, size and outcome of a part."""
     ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
     chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
     outcome = part.outcome.replace("_", " ")
@@ -236,7 +236,7 @@ def _by_size(part: SizedFinding, digits: int) -> list[str | Cell]:
 
 
 def side_by_side(studies: Mapping[str, Sequence[Answer]], how: str) -> pd.DataFrame:
-    """`parts` of several studies by the second rule, in short, each study in a column."""
+    """`parts` of several studies in short, each study in a column."""
     part, columns = ["", "environment", "metric", "over"], []
     for answers in studies.values():
         frame = parts(answers, how, {})

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from mace_rl.study.claims_config import Table1Config
-from mace_rl.study.compare.ledger import Answer, Judgement, SizedFinding
+from mace_rl.study.compare.ledger import Answer, Judgement
 from mace_rl.study.show.curves import (
     LEGEND_HEIGHT,
     PlotStyle,
@@ -20,7 +20,7 @@ from mace_rl.study.show.curves import (
     legend,
     style,
 )
-from mace_rl.study.show.pictures import INK, NO_ROOM, OUTCOMES, wrapped
+from mace_rl.study.show.pictures import INK, OUTCOMES, wrapped
 
 LINE = 0.15  # inches
 SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
@@ -46,7 +46,7 @@ def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
 
 
 def _counted(judged: Judgement) -> tuple[Any, ...]:
-    parts = [part for part in judged.parts if isinstance(part, SizedFinding)]
+    parts = judged.parts
     shown = [part for part in parts if part.outcome == "shown"]
     worth = sum(part.size == "worth mentioning" for part in shown)
     room = [part.room / part.worth_mentioning for part in parts]
@@ -55,7 +55,6 @@ def _counted(judged: Judgement) -> tuple[Any, ...]:
 
 def draw_verdicts(table: pd.DataFrame) -> Figure:
     """A cell per claim and world in the verdict's colour; in it what is shown, and the room."""
-    colours = OUTCOMES | NO_ROOM
     claims = table.drop_duplicates("claim")
     named = zip(claims["claim"], claims["statement"], strict=True)
     said = {claim: wrapped(f"{claim} {statement}", 46) for claim, statement in named}
@@ -70,7 +69,7 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         rows: Any = table.itertuples()
         for row in rows:
             left, height = worlds.index(row.world), heights[list(said).index(row.claim)]
-            colour, _ = colours[row.outcome]
+            colour, _ = OUTCOMES[row.outcome]
             size = f", {row.worth} worth mentioning" if row.shown else ""
             room = " to ".join(
                 dict.fromkeys(f"{one:.3g}" for one in (row.least_room, row.most_room))
