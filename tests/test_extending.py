@@ -227,7 +227,10 @@ def test_what_the_page_shows_works(tmp_path, monkeypatch):
 # --- Links ----------------------------------------------------------------------------------------
 
 TOP = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
+# What was fixed before its runs stays as it was, links too.
+FROZEN = "worlds-protocol.md"
 PAGES = [*(ROOT / name for name in TOP), *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [page for page in PAGES if page.name != FROZEN]
 
 
 def anchors(page: Path) -> set[str]:
