@@ -56,7 +56,7 @@ bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a chan
 	@$(call one_of,BENCH,quick)
 	@$(IN_VENV) $(if $(BENCH),benchmarks.guard,benchmarks)
 
-verify: setup ## repeat some of the nine short runs, one each of tuned, plain, our tasks: to the bit (SAMPLE=3)
+verify: setup ## repeat some of the twelve short runs, one each of tuned, plain, our tasks: to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 	folder=$$(mktemp -d)
 	trap 'rm -rf "$$folder"' EXIT
