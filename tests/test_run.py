@@ -347,39 +347,50 @@ def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path
 # --- What a run depends on ------------------------------------------------------------------------
 
 PARTS = ("training", "everything")
-CHANGES = [  # of a file, and whether a training has other sources then
-    ("agent/ppo.py", True),
-    ("config/agent.py", True),
-    ("study/measure/metrics.py", False),
-    ("records.py", True),
-    ("study/show/report.py", False),
-    ("a_new_file.py", True),
-    ("beta/weights.npz", True),
+CHANGES = [  # of a file, what is added, whether a training has other sources, and all
+    ("agent/ppo.py", "ADDED = 1", True, True),
+    ("config/agent.py", "ADDED = 1", True, True),
+    ("study/measure/metrics.py", "ADDED = 1", False, True),
+    ("records.py", "ADDED = 1", True, True),
+    ("study/show/sections.py", 'CAPTION = "another"', False, True),
+    ("a_new_file.py", "ADDED = 1", True, True),
+    ("beta/weights.npz", "x", True, True),
+    ("outlets.py", "", False, False),  # a blank line
+    ("agent/ppo.py", "# a comment", False, False),
+    ("agent/ppo.py", '"""Not the docstring."""', True, True),  # a statement
 ]
 
 
-@pytest.mark.parametrize(("name", "expected"), CHANGES)
-def test_what_an_edit_changes(tmp_path, name, expected):
+@pytest.mark.parametrize(("name", "added", "training", "everything"), CHANGES)
+def test_what_an_edit_changes(tmp_path, name, added, training, everything):
 
-    def digests(*own: Path) -> dict[str, str]:
+    def sources_of_the_copy():
         spec = spec_from_file_location("sources_of_a_copy", tmp_path / "mace_rl" / "sources.py")
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
-        return {part: module.digest(part, *own) for part in PARTS}
+        return module
+
+    def digests(*own: Path) -> dict[str, str]:
+        return {part: sources_of_the_copy().digest(part, *own) for part in PARTS}
 
     shutil.copytree(
         sources.PACKAGE, tmp_path / "mace_rl", ignore=shutil.ignore_patterns("__pycache__")
     )
-    before = digests()
+    before, kernels = digests(), sources_of_the_copy().training_bytes()
     assert before == {part: sources.digest(part) for part in PARTS}
     assert all((sources.PACKAGE / name).exists() for name in sources.NO_PART)
     file = tmp_path / "mace_rl" / name
-    content = file.read_bytes() if file.exists() else None
-    file.write_bytes((content or b"") + b"\n")
+    content = file.read_bytes() if file.exists() else b""
+    file.write_bytes(content + f"\n{added}\n".encode())
     changed = {part for part, value in digests().items() if value != before[part]}
-    assert changed == ({"training", "everything"} if expected else {"everything"})
+    assert changed == {
+        part for part, does in zip(PARTS, (training, everything), strict=True) if does
+    }
+    # A caption recompiles nothing; what trains does, whatever the edit.
+    recompiled = sources_of_the_copy().training_bytes() != kernels
+    assert recompiled == (not name.startswith("study/"))
     own = tmp_path / "own.py"
-    own.touch()
+    own.write_text('"""Words."""\n')
     with_own = digests(own)
     own.write_text("x = 1\n")
     assert all(digests(own)[part] != value for part, value in with_own.items())
