@@ -28,7 +28,9 @@ LETTERS = 140  # about as many as stand side by side in a legend
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
 INSET = (0.4, 0.14, 0.58, 0.56)  # left, bottom, width and height, in the panel
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
-HIDDEN = 0.01  # of what all means span: lines so near to each other are one to the eye
+SINGLE_SEEDS = 10  # with more, lines of single seeds hide the mean and its band
+# Dashes of the variants, in their order: colours alone are not told apart in grey, nor by everybody.
+DASHES = ("-", (0, (6, 1.5)), (0, (2, 1)), (0, (6, 1, 1, 1)), (0, (1, 1.5)))
 _TICKS = {"size": 3, "width": 0.8}  # points
 
 
@@ -144,6 +146,8 @@ def draw_figure(
         for environment, axes in zip(environments, panels, strict=True):
             own, runs = (frame[frame["env"] == environment] for frame in (curves, single_seeds))
             values = runs[shown.name]
+            if own["n"].max() > SINGLE_SEEDS:
+                values = own[["mean", "lower", "upper"]].stack()
             margin = 0.05 * (values.max() - values.min() or 1)
             spanned = values.min() - margin, values.max() + margin
             axes.set_ylim(reaching(shown.limits, values) if shown.limits else spanned)
@@ -155,7 +159,7 @@ def draw_figure(
             for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
                 faint: dict[str, Any] = {"color": look.colours[variant], "linewidth": 0.5}
                 faint |= {"alpha": 0.6 / math.sqrt(seeds[variant]), "zorder": 1}
-                if seeds[variant] > 1:  # else its line is the mean's
+                if 1 < seeds[variant] <= SINGLE_SEEDS:  # the line of one is the mean's
                     axes.plot(run["episode"], run[shown.name], **faint)
             share = look.layout.inset
             if share and shown.limits is None and _is_early(own, share) and _is_free(axes, own):
@@ -168,7 +172,9 @@ def draw_figure(
         if most > 1:
             band = f" Band: its {100 * look.confidence:g} % interval." if most >= BAND_SEEDS else ""
             line = f"Line: mean over {from_to(curves['n'])} seeds."
-            explained = f"{line}{band} Faint lines: single seeds."
+            explained = line + band
+            if curves["n"].min() <= SINGLE_SEEDS:
+                explained += " Faint lines: single seeds."
         if look.layout.inset and any(axes.child_axes for axes in panels):
             explained += f" Inset: the first {100 * look.layout.inset:g} %."
         legend(figure, explained)
@@ -263,17 +269,13 @@ def _is_free(axes: Axes, curves: pd.DataFrame) -> bool:
 
 
 def draw_means(axes: Axes, curves: pd.DataFrame, look: PlotStyle) -> None:
-    """Means and bands of one environment; a mean that covers others leaves gaps to see them by."""
-    drawn: list[np.ndarray] = []
-    near = HIDDEN * np.ptp(curves["mean"])
-    for name, curve in curves.groupby("variant", sort=False):
+    """Means and bands of one environment, each variant with its own dashes."""
+    for place, (name, curve) in enumerate(curves.groupby("variant", sort=False)):
         variant, episodes, mean = str(name), curve["episode"], curve["mean"].to_numpy()
         colour = look.colours[variant]
         if curve["n"].max() >= BAND_SEEDS:
             band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0, "zorder": 2}
             axes.fill_between(episodes, curve["lower"], curve["upper"], **band)
-        covered = sum(len(mean) == len(one) and abs(mean - one).max() <= near for one in drawn)
-        drawn.append(mean)
         line: dict[str, Any] = {"color": colour, "linewidth": 1.3, "zorder": 3}
-        line["linestyle"] = (0, (4, 4 * covered)) if covered else "-"
+        line["linestyle"] = DASHES[place % len(DASHES)]
         axes.plot(episodes, mean, label=look.labels[variant], **line)
