@@ -101,7 +101,7 @@ def test_figures(runs, tmp_path, number):
     assert (tmp_path / name).read_bytes() == (EXPECTED / name).read_bytes()
 
 
-@pytest.mark.parametrize("variant", sorted({*VARIANTS} - {"mace_full"}))  # its LSTM reads it
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("environment", STUDY.environments)
 def test_the_first_episodes_do_not_depend_on_the_budget(run_config, environment, variant):
     short, long = (finish(run_config(environment, variant, 3, episodes=n)) for n in (6, 10))
