@@ -26,7 +26,8 @@ from mace_rl.study.show.sections import Section
 from mace_rl.study.show.tables import side_by_side
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
-CONFIG = Path("config.yaml")  # every world has its labels, colours and measures
+CONFIG = Path("config.yaml")  # every world has its labels, colours and measures ...
+VARIANTS = Path("config/worlds/tuned.yaml")  # ... and variants that this has
 DECIDES = "robust"  # the way to measure that is counted and pictured
 COMMAND = "`python -m tools.worlds`"
 # The metrics that the protocol names; the first is not the public code's rule, as its words ask.
@@ -36,7 +37,7 @@ RULE = "[rule](../../../docs/metrics.md#the-rule)"
 
 def make(folder: Path) -> list[str]:
     """Make FOLDER/worlds; returns what it then has, nothing if there is no world."""
-    study = read_study([CONFIG])
+    study = read_study([CONFIG, VARIANTS])
     table1 = read_claims(study, CONFIG.parent / study.claims).table1
     look = plot_style(study.metrics, study.figure.model_dump(), study.labels, study.colours)
     there = [world for world in WORLDS if (folder / world / "metrics.csv").exists()]
