@@ -29,7 +29,7 @@ BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the li
 INSET = (0.4, 0.14, 0.58, 0.56)  # left, bottom, width and height, in the panel
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
 SINGLE_SEEDS = 10  # with more, lines of single seeds hide the mean and its band
-# Dashes of the variants, in their order: colours alone are not told apart in grey, nor by everybody.
+# Of the variants, in their order: colours alone are not told apart in grey, nor by everybody.
 DASHES = ("-", (0, (6, 1.5)), (0, (2, 1)), (0, (6, 1, 1, 1)), (0, (1, 1.5)))
 _TICKS = {"size": 3, "width": 0.8}  # points
 
