@@ -165,6 +165,7 @@ def test_the_last_lines_are_true_in_each_of_snakemake_s_modes(finished: Project,
 
 
 TRAIN = {"train": 6, **EVALUATION}
+MEASURED = EVALUATION | {"table2": 1}
 CONFIG = "config.yaml"
 CHANGES = [  # of a file, from one text to another, and what is to be done then
     (CONFIG, "tab:blue", "tab:cyan", DRAWN),
@@ -180,10 +181,11 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     ),
     (CONFIG, "seeds: [0]", "seeds: [0, 1]", TRAIN),
     (CONFIG, ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
-    ("src/mace_rl/agent/ppo.py", "\n", "\n\n", TRAIN | {"table2": 1}),
-    ("src/mace_rl/study/measure/metrics.py", "\n", "\n\n", EVALUATION | {"table2": 1}),
-    ("workflow/scripts/train.py", "\n", "\n\n", TRAIN),
-    ("workflow/scripts/tables.py", "\n", "\n\n", TABLES),
+    ("src/mace_rl/agent/ppo.py", "\n\nimport", "\n\nN = 1\nimport", TRAIN | {"table2": 1}),
+    ("src/mace_rl/agent/ppo.py", "\n\nimport", "\n# Of no meaning.\n\nimport", {}),
+    ("src/mace_rl/study/measure/metrics.py", "\n\nimport", "\n\nN = 1\nimport", MEASURED),
+    ("workflow/scripts/train.py", "\n\nimport", "\n\nN = 1\nimport", TRAIN),
+    ("workflow/scripts/tables.py", "\n\nfrom", "\n\nN = 1\nfrom", TABLES),
     ("config/claims.yaml", "[140, 660]", "[141, 660]", PAPERS),
     (*("results/metrics.csv", "CartPole-v1,ppo,0", "CartPole-v1,ppo,7"), {**TABLES, "picture": 1}),
 ]
