@@ -25,6 +25,7 @@ MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 LETTERS = 140  # about as many as stand side by side in a legend
+SAMPLE = 6  # a legend's line and the space beside it, in letters
 BAND_SEEDS = 3  # with two, t's interval covers the whole panel and hides the lines
 INSET = (0.4, 0.14, 0.58, 0.56)  # left, bottom, width and height, in the panel
 MOSTLY = 0.75  # of the way from the lowest to the highest mean, for an inset of the beginning
@@ -203,7 +204,8 @@ def legend(figure: Figure, explained: str) -> None:
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, handle)
-    columns = max(1, min(len(entries), 4, LETTERS // max(map(len, entries), default=1)))
+    longest = max(map(len, entries), default=0) + SAMPLE
+    columns = max(1, min(len(entries), 4, LETTERS // longest))
     how: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "title": explained}
     for line in figure.legend(list(entries.values()), list(entries), **how).get_lines():
         line.set_linewidth(2)
