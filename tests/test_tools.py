@@ -1,6 +1,7 @@
 """tools/ and benchmarks/: kept tables, random returns, the archive for a DOI, what is measured."""
 
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,13 @@ from mace_rl.runs import run
 from mace_rl.study.config import read_study
 from tools import kept_runs, random_return, tables
 from tools.deposit import DepositError, deposit
+
+
+def test_the_study_that_make_report_shows_is_kept() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = {*re.findall(r"\(STUDY=(\w+)\)|\$\(STUDY\),(\w+)\)", makefile)}
+    studies = yaml.safe_load((ROOT / "reference/studies.yaml").read_text(encoding="utf-8"))
+    assert {"".join(pair) for pair in named} == {"tuned"} and "tuned" in studies
 
 
 def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:

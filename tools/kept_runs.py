@@ -1,7 +1,7 @@
 """Keep finished runs small, or put kept ones back: exact, one file per environment and variant.
 
-    .venv/bin/python -m tools.kept_runs pack RESULTS ARCHIVE      results/study reference/study
-    .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS    reference/study results/study
+    .venv/bin/python -m tools.kept_runs pack RESULTS ARCHIVE
+    .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS
     .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS --sample 3       (make verify)
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
@@ -253,7 +253,7 @@ def main() -> None:
     commands = {"pack": pack, "unpack": unpack}
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog="example: python -m tools.kept_runs pack results reference/study",
+        epilog="example: python -m tools.kept_runs pack results reference/worlds/tuned",
     )
     parser.add_argument("command", choices=commands)
     parser.add_argument("origin", type=Path, help="RESULTS to pack, or the ARCHIVE to unpack")
