@@ -15,7 +15,7 @@ from gymnasium.spaces import Discrete
 from mace_rl.beta.controller import BetaController, Effect
 from mace_rl.beta.credit import Judge
 from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork, TorchMetaNetwork
-from mace_rl.beta.squash import beta_of, logit
+from mace_rl.beta.squash import beta_of, logit, natural_log
 from mace_rl.config.beta import MetaConfig
 from mace_rl.environments.rollout import Episode
 from mace_rl.environments.spaces import Spaces
@@ -53,26 +53,30 @@ class MetaAdaptation(Stateful, BetaController):
         self.judge, self.evidence = Judge(config), Evidence(config)
         self.normaliser = RunningNormaliser(inputs)  # of what the LSTM reads
         # What was read for β: of the next episode, None before the first; of each since the last
-        # update; and of each rollout whose β is being judged, with the mean output.
+        # update, with its output; of each rollout whose β is being judged, with the mean output.
         self.source: np.ndarray | None = None
-        self.sources: list[np.ndarray] = []
+        self.sources: list[tuple[np.ndarray, float]] = []
         self.judged: deque[tuple[list[np.ndarray], float]] = deque()
-        self.output: float | None = None  # for `source`, once somebody has asked
+        self.known: float | None = None  # the output for `source`, once somebody has asked
 
     @property
     def beta(self) -> float:
         """See `BetaController`; from the network as it is now."""
         if self.source is None:
             return beta_of(self.initial)
-        if self.output is None:
-            self.output = self.network.output(self.source)
-        return beta_of(self.initial + self.evidence.logit(self.output))
+        return beta_of(self.initial + self.evidence.logit(self.output(self.source)))
+
+    def output(self, source: np.ndarray) -> float:
+        """The network's for `self.source`, which it is asked once until it learns."""
+        if self.known is None:
+            self.known = self.network.output(source)
+        return self.known
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
         if self.source is not None:
-            self.sources.append(self.source)
-        self.source, self.output = self.read(episode, bonus), None
+            self.sources.append((self.source, self.output(self.source)))
+        self.source, self.known = self.read(episode, bonus), None
 
     def read(self, episode: Episode, bonus: np.ndarray) -> np.ndarray:
         """What the LSTM reads of an episode, float32 [at most `chunks`, in].
@@ -100,8 +104,8 @@ class MetaAdaptation(Stateful, BetaController):
         if several:
             places = np.arange(self.config.sequences) * len(chosen) // self.config.sequences
             chosen = [chosen[place] for place in places]
-        outputs = [self.network.output(sequence) for sequence in chosen]
-        self.judged.append((chosen, sum(outputs) / max(len(outputs), 1)))
+        mean_output = sum(output for _, output in chosen) / max(len(chosen), 1)
+        self.judged.append(([sequence for sequence, _ in chosen], mean_output))
         self.sources = []
         if credit is None:
             return None
@@ -109,7 +113,7 @@ class MetaAdaptation(Stateful, BetaController):
         if sequences:  # the first episode's β was given
             self.evidence.add(credit, output)
             self.network.learn(sequences, credit)
-            self.output = None
+            self.known = None
         return credit
 
 
@@ -151,7 +155,7 @@ class Evidence(Stateful):
         probability α at most.
         """
         known, chance = self.variance + self.config.evidence_scale, self.config.evidence_chance
-        bound = 2 * math.log(1 / chance) + math.log(known / self.config.evidence_scale)
+        bound = 2 * natural_log(1 / chance) + natural_log(known / self.config.evidence_scale)
         return max(self.sum / math.sqrt(known) - math.sqrt(bound), 0.0)
 
     def logit(self, output: float) -> float:

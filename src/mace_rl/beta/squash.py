@@ -22,4 +22,10 @@ def logistic(x: np.float32) -> float:
 @kernel
 def logit(beta: float) -> float:
     """log(β / (1 - β)), of a float64 in (0, 1), to float32's rounding."""
-    return log(np.float32(beta / (1 - beta)))
+    return natural_log(beta / (1 - beta))
+
+
+@kernel
+def natural_log(x: float) -> float:
+    """log x, to float32's rounding; the C library's differs between processors."""
+    return log(np.float32(x))

@@ -25,7 +25,7 @@ class MetaConfig(CreditConfig):
     chunks: Count  # rows at most that it reads of an episode
     sequences: Count  # episodes at most, of a rollout, that it learns from
     evidence_chance: float = Field(gt=0, lt=1)  # of trainings in which β may move for nothing
-    evidence_scale: PositiveFloat  # credits, after about as many of which evidence is best seen
+    evidence_scale: PositiveFloat  # variance of the evidence at which it is best seen
     gain: NonNegativeFloat  # of β's logit per standard deviation of evidence beyond chance
     reads: bool = True  # false: it sees a constant, whatever was played; to see what reading does
     trusts_evidence: bool = True  # false: its output moves β as it is; to see what waiting does
