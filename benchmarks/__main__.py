@@ -1,6 +1,6 @@
 """The benchmark: `python -m benchmarks [SECTION ...] [--quick]`; `make bench` does it all."""
 
-import mace_rl.pins  # noqa: F401  isort: skip  (pins NumPy before it is imported)
+import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (pins NumPy before it is imported)
 
 import argparse
 import time

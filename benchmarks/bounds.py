@@ -16,10 +16,10 @@ import numpy as np
 from numba import njit
 
 from mace_rl.agent import compiled_learner
+from mace_rl.numerics.matmul import dot, product
 from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.network import CompiledMLP
 from mace_rl.numerics.network_kernels import FEW
-from mace_rl.numerics.products import dot, product
 
 BOUNDS = ("arithmetic", "traffic")
 NUMBER = 4  # bytes of a float32

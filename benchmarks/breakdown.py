@@ -43,7 +43,7 @@ BONUS = {
 ALL_SECTIONS = list(SECTIONS | BONUS)
 # Functions of modules: section, module, name.
 FUNCTIONS = (
-    ("acting", "mace_rl.trainer", "draw_noise"),
+    ("acting", "mace_rl.training.trainer", "draw_noise"),
     ("acting", "mace_rl.agent.policy", "act_box"),
     ("update: actor", "mace_rl.agent.compiled_learner", "improve_policy"),
     ("update: critics", "mace_rl.agent.compiled_learner", "improve_values"),
@@ -103,7 +103,7 @@ def measure(scale: Scale) -> list[dict[str, Any]]:
 
 def bounds(contestant: str, environment: str, seed: int, steps: int) -> dict[str, float]:
     """Seconds that the same training cannot do without, by `BOUNDS`."""
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     trainer, work = Trainer(our_config(contestant, environment, seed)), Work()
     work.watch(trainer)
@@ -117,7 +117,7 @@ def profile(
     contestant: str, environment: str, seed: int, steps: int
 ) -> tuple[int, dict[str, float]]:
     """How many steps were done, at least `steps` from scratch, and seconds by part."""
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     warm_up(contestant, environment, seed)
     trainer = Trainer(our_config(contestant, environment, seed))
@@ -170,6 +170,6 @@ def _steps(cartpole, actions, two):
             _, terminated = classic_control.step_cartpole(state, action)
         else:
             _, terminated = classic_control.step_acrobot(state, action, two)
-        classic_control._observe(which, state, observation)
+        classic_control.observe(which, state, observation)
         if terminated:
             state[:] = 0.01

@@ -63,7 +63,7 @@ def measure(scale: Scale) -> list[dict[str, Any]]:
 
 def tenths(walk: str, episodes: int) -> list[dict[str, Any]]:
     """Steps and CPU time until the end of each tenth of one run, and memory there."""
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     register()
     config = our_config("mace_full", WALKS[walk], FIRST_SEED)

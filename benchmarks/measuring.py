@@ -94,7 +94,7 @@ def replace_section(folder: Path, section: str, rows: list[dict[str, Any]]) -> N
     """Let these be all rows of the section in the folder's file; other sections stay."""
     import pandas as pd  # not in the measuring processes, whose memory counts
 
-    from mace_rl.files import write_atomically
+    from mace_rl.base.files import write_atomically
     from mace_rl.runs.provenance import cpu_model, git_state
 
     folder.mkdir(exist_ok=True)

@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 from benchmarks import breakdown, purejaxrl, speed, workflow
 from benchmarks.bounds import BOUNDS
 from benchmarks.measuring import ENVIRONMENTS, FILE
-from mace_rl.files import write_atomically
+from mace_rl.base.files import write_atomically
 
 HEAD = """# Measurements
 

@@ -16,7 +16,6 @@ from benchmarks.measuring import (
     ENVIRONMENTS,
     FIRST_SEED,
     HOPPER,
-    ROOT,
     Scale,
     in_fresh_process,
     memory_mb,
@@ -108,8 +107,8 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
         case "environment":
             return alone(gymnasium.make(environment, disable_env_checker=True), seed, steps)
         case "environment_ours":
+            from mace_rl.base.rng import Streams
             from mace_rl.environments.environment import Environment
-            from mace_rl.streams import Streams
 
             ours = Environment(environment, Streams(seed).sequence("environment"))
             return alone(ours.env, seed, steps)
@@ -119,7 +118,7 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
             full_batch = {"n_steps": 2048, "batch_size": 2048, "n_epochs": 4}
             return stable_baselines3(environment, seed, steps, **full_batch)
         case _:
-            from mace_rl.trainer import Trainer
+            from mace_rl.training.trainer import Trainer
 
             trainer = Trainer(our_config(contestant, environment, seed))
             return (records[-1].env_steps for records in trainer.run())
@@ -127,9 +126,9 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
 
 def our_config(contestant: str, environment: str, seed: int) -> "RunConfig":
     """The study's settings of one of `OURS`, but without an end."""
-    from mace_rl.study.config import read_study
+    from mace_rl.library import settings
 
-    config = read_study([ROOT / "config.yaml"]).run_config(environment, OURS[contestant], seed)
+    config = settings(environment, OURS[contestant], seed=seed)
     whole = {"rollout_steps": 2048, "minibatch_size": None} if contestant == "ppo_2048" else {}
     ppo = config.ppo.model_copy(update=whole)
     return config.model_copy(update={"ppo": ppo, "episodes": ENDLESS})

@@ -7,7 +7,7 @@ their means over the seeds and the differences, with 95 % intervals.
 import argparse
 import sys
 
-import mace_rl.pins  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
+import mace_rl.base.cpu_features  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
 
 import gymnasium
 import numpy as np
@@ -15,8 +15,8 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from mace_rl.study.compare.statistics import mean_interval, paired_comparison
-from mace_rl.wrappers import CuriosityReward
+from mace_rl.wrapping.wrappers import CuriosityReward
+from mace_study.compare.statistics import mean_interval, paired_comparison
 
 MEASURES = ("all episodes", "last tenth")
 

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, ValidationInfo, field_validator
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.section import Count, Section, check
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import total
-from mace_rl.state import Stateful
 
 
 class Settings(Section):

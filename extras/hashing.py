@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from mace_rl.base.state import Stateful
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.section import Count, Section, check
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.state import Stateful
 
 
 class Settings(Section):

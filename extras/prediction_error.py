@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PositiveFloat
 
+from mace_rl.base.state import Stateful
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.section import Count, Section, Units
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.adam import Adam
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.state import Stateful
 
 CLIP = 5.0  # bound of whitened observations, in standard deviations (Burda et al. 2018, 2.4)
 

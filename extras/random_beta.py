@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.section import Section, check
-from mace_rl.environments.rollout import Episode
-from mace_rl.state import Stateful
+from mace_rl.environments.episode import Episode
 
 
 class Settings(Section):

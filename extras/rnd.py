@@ -7,10 +7,10 @@ import numpy as np
 
 from extras.prediction_error import PredictionError, PredictorSettings
 from mace_rl.config.section import Units, check
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
+from mace_rl.numerics.matmul import dot
 from mace_rl.numerics.network import CompiledMLP, mlp
-from mace_rl.numerics.products import dot
 
 
 class Settings(PredictorSettings):

@@ -14,14 +14,14 @@ from typing import Any
 # As in training, here and in the processes that tests start; numpy and torch read it once.
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import mace_rl.pins  # noqa: F401  isort: skip  (pins NumPy before it is imported)
+import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (pins NumPy before it is imported)
 
 import gymnasium
 import pytest
 
 from mace_rl.config.run import RunConfig
 from mace_rl.environments import registered
-from mace_rl.study.config import Study, read_study
+from mace_study.config.study import Study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 
@@ -86,8 +86,8 @@ def make_ppo(run_config):
     """`make_ppo(environment, seed, intrinsic, engine, **settings of ppo)`."""
     from shared import environment_of
 
-    from mace_rl import factories
-    from mace_rl.streams import Streams
+    from mace_rl.base.rng import Streams
+    from mace_rl.training import factories
 
     def make(environment="CartPole-v1", seed=0, intrinsic=False, engine="compiled", **settings):
         config = run_config(environment, "ppo", seed, ppo=settings, engine=engine)
@@ -119,7 +119,7 @@ def kill(monkeypatch):
     from shared import Killed
 
     from mace_rl.runs import run
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     improve = Trainer.improve
 

@@ -24,12 +24,12 @@ from matplotlib.text import Text
 
 from mace_rl import cli
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
+from mace_rl.base.files import LOCK
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
-from mace_rl.files import LOCK
 from mace_rl.numerics.network import CompiledMLP, Network, TorchNetwork
 from mace_rl.numerics.normaliser import Normalisation
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
 ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}

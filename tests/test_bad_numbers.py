@@ -9,9 +9,9 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
 from shared import NETWORKS, SOON, Bonanza, Twin, finish
 
+from mace_rl.base.errors import Refusal
 from mace_rl.numerics.finite import NonFiniteError
-from mace_rl.refusal import Refusal
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 
 
 @pytest.mark.parametrize(

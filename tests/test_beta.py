@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from shared import ROOT, environment_of, finish
 
+from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
 from mace_rl.beta.pretrained import PretrainedAdaptation
-from mace_rl.environments.rollout import Episode
-from mace_rl.factories import beta_controller
-from mace_rl.streams import Streams
-from mace_rl.study.config import read_study
-from mace_rl.trainer import Trainer
+from mace_rl.environments.episode import Episode
+from mace_rl.training.factories import beta_controller
+from mace_rl.training.trainer import Trainer
+from mace_study.config.study import read_study
 
 
 def episode_of(extrinsic_return: float) -> Episode:

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from invented import CONFIG, averages, curve, frame, noisy
 
-from mace_rl.records import read_table
-from mace_rl.study.measure import betas as b
+from mace_rl.training.records import read_table
+from mace_study.measure import betas as b
 
 
 def test_betas_are_measured_like_returns(tmp_path):

@@ -15,9 +15,9 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from shared import RESULTS, Killed, content_of, provenance_of
 
-from mace_rl import sources
+from mace_rl.base import code_digest
 from mace_rl.runs import checkpoint, provenance, run
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 
 
 class Bomb:
@@ -60,7 +60,11 @@ def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch
         ({"ppo": {"clip": 0.3}}, None, "config.ppo.clip was 0.2 and is 0.3"),
         ({"beta": {"kind": "none"}}, None, "config.beta.kind was 'meta' and is 'none'"),
         ({}, (provenance, "versions", lambda: found | {"torch": "9.9"}), "versions.torch was "),
-        ({}, (sources, "digest", lambda *paths: "0" * 64), "unfinished run of other code, in mace"),
+        (
+            {},
+            (code_digest, "digest", lambda *paths: "0" * 64),
+            "unfinished run of other code, in mace",
+        ),
     ]
     for number, (changes, replaced, message) in enumerate(others, start=1):
         other = run_config("CartPole-v1", "mace_full", **{"episodes": 6} | changes)

@@ -25,11 +25,11 @@ from invented import (
 from shared import refused
 
 from mace_rl.config.section import ConfigError
-from mace_rl.records import RecordError
-from mace_rl.study.claims_config import parts_of, read_claims
-from mace_rl.study.compare import verdicts
-from mace_rl.study.compare.ledger import Finding, read_ledger, to_json
-from mace_rl.study.measure.betas import BEFORE
+from mace_rl.training.records import RecordError
+from mace_study.compare import verdicts
+from mace_study.compare.claims_config import parts_of, read_claims
+from mace_study.compare.ledger import Finding, read_ledger, to_json
+from mace_study.measure.betas import BEFORE
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}

@@ -21,7 +21,7 @@ from mace_rl import __main__, cli
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.runs import run
-from mace_rl.study.config import load_study
+from mace_study.config.study import load_study
 
 CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 

@@ -13,10 +13,10 @@ from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.policy import Policy
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.run import RunConfig
-from mace_rl.experience import Experience
 from mace_rl.numerics.adam import Adam
 from mace_rl.numerics.network import CompiledMLP, mlp
-from mace_rl.trainer import Trainer
+from mace_rl.training.experience import Experience
+from mace_rl.training.trainer import Trainer
 
 
 class SmallProblem:

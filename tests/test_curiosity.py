@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from shared import environment_of
 
-from mace_rl import factories
+from mace_rl.base.rng import Streams
 from mace_rl.bonus.curiosity import Curiosity, relevance
-from mace_rl.environments.rollout import Episode
-from mace_rl.streams import Streams
+from mace_rl.environments.episode import Episode
+from mace_rl.training import factories
 
 
 def episode_of(states, rewards=None) -> Episode:

@@ -13,9 +13,9 @@ import torch
 from shared import ROOT, call, refusal
 from tensorboardX.proto.event_pb2 import Event
 
-from mace_rl import files
+from mace_rl.base import files
 from mace_rl.runs import checkpoint
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 
 
 @pytest.fixture

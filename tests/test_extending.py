@@ -15,17 +15,17 @@ from invented import table_for_tables
 from shared import ROOT, call, refusal
 
 from mace_rl.library import settings
-from mace_rl.records import read_episodes
 from mace_rl.runs.agent import load_agent
-from mace_rl.study.claims_config import read_claims
-from mace_rl.study.compare.summary import split, summary
-from mace_rl.study.compare.verdicts import ledger
-from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import LearningCurve, all_metrics
-from mace_rl.study.show import tables
-from mace_rl.study.show.latex import table1_latex
-from mace_rl.study.show.markdown import markdown
-from mace_rl.study.show.pictures import PICTURES, Source
+from mace_rl.training.records import read_episodes
+from mace_study.compare.claims_config import read_claims
+from mace_study.compare.summary import split, summary
+from mace_study.compare.verdicts import ledger
+from mace_study.config.study import read_study
+from mace_study.measure.metrics import LearningCurve, all_metrics
+from mace_study.show import tables
+from mace_study.show.latex import table1_latex
+from mace_study.show.markdown import markdown
+from mace_study.show.pictures import PICTURES, Source
 
 TEXT = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(?:python|yaml)\n(.*?)```", TEXT, re.DOTALL)

@@ -11,6 +11,7 @@ import torch
 import yaml
 from shared import ROOT, call, finish, play, refused
 
+from mace_rl.base.errors import Refusal
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.flag import FlagNovelty
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
@@ -18,13 +19,12 @@ from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.finite import NonFiniteError
-from mace_rl.refusal import Refusal
 from mace_rl.runs import run
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.study.config import read_study
-from mace_rl.trainer import Trainer
-from mace_rl.wrappers import CuriosityReward
+from mace_rl.training.trainer import Trainer
+from mace_rl.wrapping.wrappers import CuriosityReward
+from mace_study.config.study import read_study
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 ENTRIES = [yaml.safe_load(one) for one in re.findall(r"`(\w+: \{kind: custom.*?extras.*\})`", PAGE)]

@@ -22,13 +22,13 @@ from invented import (
 )
 from shared import illegible
 
-from mace_rl.records import RecordError
-from mace_rl.study.compare.ledger import Answer
-from mace_rl.study.compare.statistics import mean_interval
-from mace_rl.study.compare.verdicts import ledger
-from mace_rl.study.metrics_config import ConstantsConfig, FigureConfig, MetricsConfig
-from mace_rl.study.show import curves as c
-from mace_rl.study.show.pictures import PICTURES, Source
+from mace_rl.training.records import RecordError
+from mace_study.compare.ledger import Answer
+from mace_study.compare.statistics import mean_interval
+from mace_study.compare.verdicts import ledger
+from mace_study.config.metrics import ConstantsConfig, FigureConfig, MetricsConfig
+from mace_study.show import curves as c
+from mace_study.show.pictures import PICTURES, Source
 
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
 RETURN, BETA = c.quantity("1", METRICS), c.quantity("2", METRICS)

@@ -13,9 +13,9 @@ import pytest
 from invented import episode_columns
 from shared import message
 
-from mace_rl import files
-from mace_rl.records import rounded, write_episodes
+from mace_rl.base import files
 from mace_rl.runs.provenance import file_digest
+from mace_rl.training.records import rounded, write_episodes
 from tools import kept_runs
 
 

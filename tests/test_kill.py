@@ -21,7 +21,7 @@ import pytest
 from shared import ENVIRONMENTS, OUTCOME, RESULTS, VARIANTS, provenance_of
 from shared import files as files_in
 
-from mace_rl import files
+from mace_rl.base import files
 
 pytestmark = [pytest.mark.slow, pytest.mark.kill]
 

@@ -9,8 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from mace_rl.config.section import ConfigError
-from mace_rl.study.config import Variant
-from mace_rl.study.labels import escaped, packages, require_latex
+from mace_study.config.labels import escaped, packages, require_latex
+from mace_study.config.study import Variant
 
 
 def allowed(label: str) -> bool:

@@ -18,11 +18,11 @@ from shared import OUTCOME, ROOT, call, refused
 
 import mace_rl
 from mace_rl import load_agent, settings, train
+from mace_rl.base.errors import Refusal
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics import compiling
-from mace_rl.records import read_episodes
-from mace_rl.refusal import Refusal
+from mace_rl.training.records import read_episodes
 
 HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]
 
@@ -35,7 +35,7 @@ def told(code: str) -> list:
 @pytest.mark.slow
 def test_importing_loads_little_and_changes_nothing():
     loaded, changed, cache = told(
-        "import json, os, sys; before = dict(os.environ); import mace_rl.wrappers, numba; "
+        "import json, os, sys; before = dict(os.environ); import mace_rl.wrapping.wrappers, numba; "
         "print(json.dumps([list(sys.modules), before != os.environ, numba.config.CACHE_DIR]))"
     )
     assert not {*HEAVY} & {*loaded} and not changed
@@ -45,7 +45,7 @@ def test_importing_loads_little_and_changes_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.pins"])
+@pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.base.cpu_features"])
 def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
     numpy_has, torch_has = told(
         f"import {module}, json, torch; from numpy._core._multiarray_umath import __cpu_features__;"
@@ -56,7 +56,7 @@ def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
 
 def test_each_name_is_what_its_module_has_and_no_other_is_there():
     assert mace_rl.train.__module__ == mace_rl.settings.__module__ == "mace_rl.library"
-    assert mace_rl.CuriosityReward.__module__ == "mace_rl.wrappers"
+    assert mace_rl.CuriosityReward.__module__ == "mace_rl.wrapping.wrappers"
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
         mace_rl.trian  # noqa: B018
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 from shared import environment_of
 
+from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import Effect
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states
 from mace_rl.beta.meta import Evidence, MetaAdaptation
 from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
-from mace_rl.environments.rollout import Episode
-from mace_rl.factories import beta_controller
-from mace_rl.streams import Streams
+from mace_rl.environments.episode import Episode
+from mace_rl.training.factories import beta_controller
 
 
 def invented(rng, steps: int, seen: int = 4, actions: int = 2) -> tuple[Episode, np.ndarray]:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented import averages, curve, noisy
 
-from mace_rl.study.measure import metrics as m
+from mace_study.measure import metrics as m
 
 
 def ramp(flat_before, rise, flat_after):

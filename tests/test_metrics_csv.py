@@ -9,9 +9,9 @@ import pytest
 from invented import CONFIG, SETTINGS, frame, noisy
 
 from mace_rl.config.section import ConfigError, check
-from mace_rl.records import RecordError
-from mace_rl.study.measure import metrics as m
-from mace_rl.study.metrics_config import GOALS, MetricsConfig
+from mace_rl.training.records import RecordError
+from mace_study.config.metrics import GOALS, MetricsConfig
+from mace_study.measure import metrics as m
 
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "env": "CartPole-v1",
@@ -139,7 +139,7 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
 
 NOT_FINITE = "is nan, but should be a finite number"
 NO_METRIC = [  # what is given, and what is said of it
-    (3, "is no mace_rl.study.measure.metrics.Metric but of type int"),
+    (3, "is no mace_study.measure.metrics.Metric but of type int"),
     (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
     (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
     (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),

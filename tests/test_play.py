@@ -16,7 +16,8 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from PIL import Image
 from shared import LAYER_NORM, call, finish, likeliest, refused
 
-from mace_rl import files, settings, train
+from mace_rl import settings, train
+from mace_rl.base import files
 from mace_rl.config.reading import merge
 from mace_rl.config.section import ConfigError
 from mace_rl.runs import watch
@@ -24,7 +25,7 @@ from mace_rl.runs.agent import Agent, load_agent
 from mace_rl.runs.evaluate import evaluate
 from mace_rl.runs.finished import FinishedRun, finished
 from mace_rl.runs.observations import ObservationError, encoded
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 
 
 @pytest.mark.parametrize(

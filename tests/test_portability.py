@@ -11,14 +11,14 @@ from invented import CLAIMS
 from numba.core.registry import cpu_target
 from shared import ROOT, VARIANTS, finish, provenance_of
 
-from mace_rl.records import EpisodeRecord, RunKey, as_columns
-from mace_rl.study.compare.summary import split, summary
-from mace_rl.study.config import read_study
-from mace_rl.study.measure.metrics import metrics_table
-from mace_rl.study.show import curves
-from mace_rl.study.show.latex import table1_latex
+from mace_rl.training.records import EpisodeRecord, RunKey, as_columns
+from mace_study.compare.summary import split, summary
+from mace_study.config.study import read_study
+from mace_study.measure.metrics import metrics_table
+from mace_study.show import curves
+from mace_study.show.latex import table1_latex
 
-PRODUCTS = f"{Path(__file__).with_name('test_products.py')}::test_every_element_is_one_chain"
+PRODUCTS = f"{Path(__file__).with_name('test_matmul.py')}::test_every_element_is_one_chain"
 HAS_AVX512 = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
 STRANGE = {"PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 STRANGE |= {"LC_ALL": "C", "LANG": "tr_TR.UTF-8", "TZ": "Asia/Kathmandu"}

@@ -10,8 +10,8 @@ from shared import ENGINES, Twin, finish
 
 from mace_rl.agent.learner import Batch
 from mace_rl.agent.ppo import PPO
+from mace_rl.base.rng import Streams
 from mace_rl.numerics.adam import Adam
-from mace_rl.streams import Streams
 
 # With Discrete and Box actions.
 both_environments = pytest.mark.parametrize("environment", ["CartPole-v1", "Pendulum-v1"])

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 from invented import ROBUST, ROOT
 
-from mace_rl import files
+from mace_rl.base import files
 from mace_rl.config.plugins import code_outside
-from mace_rl.study.config import Study, read_study
+from mace_study.config.study import Study, read_study
 from tools import kept_runs
 
 # By the commit that runs name: their protocol as it lies there, and where it lies today.

@@ -5,13 +5,13 @@ import pandas as pd
 import pytest
 from invented import CLAIMS, STUDY, frame
 
-from mace_rl.study.compare import readings as r
-from mace_rl.study.compare.statistics import logrank
-from mace_rl.study.measure.metrics import metrics_table
-from mace_rl.study.show import tables
-from mace_rl.study.show.curves import plot_style
-from mace_rl.study.show.markdown import markdown
-from mace_rl.study.show.pictures import PICTURES
+from mace_study.compare import readings as r
+from mace_study.compare.statistics import logrank
+from mace_study.measure.metrics import metrics_table
+from mace_study.show import tables
+from mace_study.show.curves import plot_style
+from mace_study.show.markdown import markdown
+from mace_study.show.pictures import PICTURES
 
 EPISODES = 400
 Frames = dict[tuple[str, str, int], pd.DataFrame]

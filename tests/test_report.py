@@ -18,18 +18,18 @@ import yaml
 from invented import CLAIMS, ENVIRONMENTS, ROOT, VARIANTS
 from PIL import Image
 
-from mace_rl import files
-from mace_rl.refusal import Refusal
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
 from mace_rl.runs.provenance import read_record
 from mace_rl.runs.run import run
-from mace_rl.study.config import read_study
-from mace_rl.study.metrics_config import ConstantsConfig
-from mace_rl.study.show.animations import animations
-from mace_rl.study.show.curves import plot_style
-from mace_rl.study.show.report import Provenance, three_digits
-from mace_rl.study.show.report import page as build
-from mace_rl.study.show.sections import read_data
-from mace_rl.study.show.tables import costs, number
+from mace_study.config.metrics import ConstantsConfig
+from mace_study.config.study import read_study
+from mace_study.show.animations import animations
+from mace_study.show.curves import plot_style
+from mace_study.show.report import Provenance, three_digits
+from mace_study.show.report import page as build
+from mace_study.show.sections import read_data
+from mace_study.show.tables import costs, number
 from tools.tables import RULES
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)

@@ -23,17 +23,17 @@ from invented import PAPERS, QUICK, VARIANTS, table_for_claims
 from shared import ROOT, Bonanza, call, environment_of, play
 
 from mace_rl import CuriosityReward, VectorCuriosityReward, load_agent
-from mace_rl.environments.resuming import global_state
-from mace_rl.environments.rollout import roll_out
-from mace_rl.files import CHECKPOINT, LOCK, RECORD
+from mace_rl.base.files import CHECKPOINT, LOCK, RECORD
 from mace_rl.numerics import compiling
 from mace_rl.runs import evaluate, run
-from mace_rl.study.compare.verdicts import ledger
-from mace_rl.study.measure.betas import BEFORE, CORRELATION, LABELS
-from mace_rl.study.metrics_config import FigureConfig
-from mace_rl.study.show import tables
-from mace_rl.study.show.curves import PlotStyle, draw_figure, quantity
-from mace_rl.study.show.sections import _others, of_ledger
+from mace_rl.training.resuming import global_state
+from mace_rl.training.rollout import roll_out
+from mace_study.compare.verdicts import ledger
+from mace_study.config.metrics import FigureConfig
+from mace_study.measure.betas import BEFORE, CORRELATION, LABELS
+from mace_study.show import tables
+from mace_study.show.curves import PlotStyle, draw_figure, quantity
+from mace_study.show.sections import _others, of_ledger
 
 DRAWS = {
     "Python's": random.random,

@@ -13,16 +13,17 @@ from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import classic_control
 from mace_rl.environments.environment import Environment
-from mace_rl.environments.rollout import (
-    Episode,
+from mace_rl.environments.episode import Episode
+from mace_rl.environments.spaces import Spaces
+from mace_rl.numerics.network import mlp
+from mace_rl.training.compiled_episode import play_compiled
+from mace_rl.training.rollout import (
     draw_noise,
     fallback_reason,
     roll_out,
     roll_out_compiled,
     rollout_for,
 )
-from mace_rl.environments.spaces import Spaces
-from mace_rl.numerics.network import mlp
 
 CLASSIC = ["CartPole-v1", "Acrobot-v1"]
 
@@ -83,7 +84,7 @@ def test_both_rollouts_play_the_same_episodes(name, kind):
         # The compiled loop's own state, in double precision, which the next step would start from.
         start, final = (np.array(each.env.unwrapped.state, np.float64) for each in (one, other))
         which = classic_control.CARTPOLE if name == "CartPole-v1" else classic_control.ACROBOT
-        classic_control.episode(which, start, again.observations[0], policy, noise)
+        play_compiled(which, start, again.observations[0], policy, noise)
         assert start.tobytes() == final.tobytes()
     assert one.generator.bit_generator.state == other.generator.bit_generator.state
     if kind == "skilled":  # the policies do what they are here for

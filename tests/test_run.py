@@ -34,13 +34,13 @@ from shared import (
     provenance_of,
 )
 
-from mace_rl import sources
+from mace_rl.base import code_digest
+from mace_rl.base.files import LOCK
 from mace_rl.environments import hopper
-from mace_rl.files import LOCK
-from mace_rl.records import RecordError
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
-from mace_rl.trainer import Trainer
+from mace_rl.training.records import RecordError
+from mace_rl.training.trainer import Trainer
 
 
 def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
@@ -62,7 +62,7 @@ def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
     for module in (torch, np, gymnasium):
         assert found["versions"][module.__name__] == module.__version__
     assert found["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["sources"] == sources.digest("training")
+    assert found["sources"] == code_digest.digest("training")
     assert set(found["code"]) == {"commit", "dirty"}
     assert found["machine"]["cores"] == os.cpu_count() and found["machine"]["cpu"]
     assert found["threads"] == 1 and found["interruptions"] == []
@@ -90,7 +90,7 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
     code = project / "src" / "mace_rl" / "runs" / "provenance.py"
     code.parent.mkdir(parents=True)
     code.write_text("1\n")
-    monkeypatch.setattr(provenance.sources, "PACKAGE", project / "src" / "mace_rl")
+    monkeypatch.setattr(provenance.code_digest, "PACKAGE", project / "src" / "mace_rl")
     unknown = provenance.git_state()
     assert "not a git repository" in unknown.pop("reason")
     assert unknown == {"commit": None, "dirty": None}
@@ -109,7 +109,7 @@ def test_the_commit_and_whether_it_is_what_ran(tmp_path, monkeypatch):
         os.chown(project / ".git", 12345, 12345)
         assert provenance.git_state() == clean | {"dirty": True}
     site = shutil.copytree(project / "src", project / "lib" / "site-packages")  # installed there
-    monkeypatch.setattr(provenance.sources, "PACKAGE", site / "mace_rl")
+    monkeypatch.setattr(provenance.code_digest, "PACKAGE", site / "mace_rl")
     assert "not a git repository" in provenance.git_state()["reason"]
 
 
@@ -236,7 +236,7 @@ def test_a_process_of_its_own_is_killed_and_resumed_by_another(
     assert process.returncode == -signal.SIGKILL
     assert {"numpy", "scipy"} < {Path(library).parts[-2].partition(".")[0] for library in threads}
     assert set(threads.values()) == {1}
-    assert {*map(Path, imported)} <= {*sources.files("training")}
+    assert {*map(Path, imported)} <= {*code_digest.files("training")}
     assert {Path(name).name for name in imported} >= {"trainer.py", "ppo.py", "run.py"}
     with caplog.at_level(logging.INFO):
         assert len(completes(config, directory)["interruptions"]) == 1
@@ -347,50 +347,54 @@ def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path
 # --- What a run depends on ------------------------------------------------------------------------
 
 PARTS = ("training", "everything")
-CHANGES = [  # of a file, what is added, whether a training has other sources, and all
-    ("agent/ppo.py", "ADDED = 1", True, True),
-    ("config/agent.py", "ADDED = 1", True, True),
-    ("study/measure/metrics.py", "ADDED = 1", False, True),
-    ("records.py", "ADDED = 1", True, True),
-    ("study/show/sections.py", 'CAPTION = "another"', False, True),
-    ("a_new_file.py", "ADDED = 1", True, True),
-    ("beta/weights.npz", "x", True, True),
-    ("outlets.py", "", False, False),  # a blank line
-    ("agent/ppo.py", "# a comment", False, False),
-    ("agent/ppo.py", '"""Not the docstring."""', True, True),  # a statement
+CHANGES = [  # of a file, what is added, whether a training has other sources, all, the kernels
+    ("mace_rl/agent/ppo.py", "ADDED = 1", True, True, True),
+    ("mace_rl/config/agent.py", "ADDED = 1", True, True, False),
+    ("mace_study/measure/metrics.py", "ADDED = 1", False, True, False),
+    ("mace_study/show/sections.py", 'CAPTION = "another"', False, True, False),
+    ("mace_rl/a_new_file.py", "ADDED = 1", True, True, False),
+    ("mace_rl/beta/weights.npz", "x", True, True, False),
+    ("mace_rl/base/stdio.py", "", False, False, False),  # a blank line
+    ("mace_rl/agent/ppo.py", "# a comment", False, False, True),
+    ("mace_rl/agent/ppo.py", '"""Not the docstring."""', True, True, True),  # a statement
 ]
 
 
-@pytest.mark.parametrize(("name", "added", "training", "everything"), CHANGES)
-def test_what_an_edit_changes(tmp_path, name, added, training, everything):
+@pytest.mark.parametrize(("name", "added", "training", "everything", "kernels"), CHANGES)
+def test_what_an_edit_changes(tmp_path, name, added, training, everything, kernels):
 
-    def sources_of_the_copy():
-        spec = spec_from_file_location("sources_of_a_copy", tmp_path / "mace_rl" / "sources.py")
+    def copy():
+        spec = spec_from_file_location("of_a_copy", tmp_path / "mace_rl" / "base" / "code_digest.py")
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
         return module
 
     def digests(*own: Path) -> dict[str, str]:
-        return {part: sources_of_the_copy().digest(part, *own) for part in PARTS}
+        return {part: copy().digest(part, *own) for part in PARTS}
 
-    shutil.copytree(
-        sources.PACKAGE, tmp_path / "mace_rl", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    before, kernels = digests(), sources_of_the_copy().training_bytes()
-    assert before == {part: sources.digest(part) for part in PARTS}
-    assert all((sources.PACKAGE / name).exists() for name in sources.NO_PART)
-    file = tmp_path / "mace_rl" / name
+    unwanted = shutil.ignore_patterns("__pycache__")
+    for package in code_digest.PACKAGES["everything"]:
+        source = code_digest.PACKAGE.parent / package
+        shutil.copytree(source, tmp_path / package, ignore=unwanted)
+    before, compiled = digests(), copy().kernels()
+    assert before == {part: code_digest.digest(part) for part in PARTS}
+    file = tmp_path / name
     content = file.read_bytes() if file.exists() else b""
     file.write_bytes(content + f"\n{added}\n".encode())
     changed = {part for part, value in digests().items() if value != before[part]}
     assert changed == {
         part for part, does in zip(PARTS, (training, everything), strict=True) if does
     }
-    # A caption recompiles nothing; what trains does, whatever the edit.
-    recompiled = sources_of_the_copy().training_bytes() != kernels
-    assert recompiled == (not name.startswith("study/"))
+    assert (copy().kernels() != compiled) == kernels
     own = tmp_path / "own.py"
     own.write_text('"""Words."""\n')
     with_own = digests(own)
     own.write_text("x = 1\n")
     assert all(digests(own)[part] != value for part, value in with_own.items())
+
+
+def test_kernels_come_from_the_folders_that_their_cache_looks_at():
+    compiling = code_digest.PACKAGE / "numerics" / "compiling.py"
+    for file in code_digest.PACKAGE.rglob("*.py"):
+        if "numerics.compiling import" in file.read_text("utf-8") and file != compiling:
+            assert file.relative_to(code_digest.PACKAGE).parts[0] in code_digest.KERNELS

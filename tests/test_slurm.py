@@ -24,8 +24,8 @@ import yaml
 from shared import ROOT, contents, provenance_of
 from snakemake.cli import parse_args
 
-from mace_rl import files
-from mace_rl.runs import queueing
+from mace_rl.base import files
+from mace_rl.runs import slurm
 
 # Slurm looks here only: Snakemake's Slurm plugin hands no SLURM_* variables on.
 CONFIGURATION = Path("/etc/slurm/slurm.conf")
@@ -295,18 +295,18 @@ def test_the_profile_has_all_of_the_default_one() -> None:
 
 def test_minutes_grow_with_the_work(run_config) -> None:
     compiled, other = run_config("CartPole-v1"), run_config("HopperBulletEnv-v0")
-    assert queueing.minutes(compiled, 0.0) == 2
-    assert queueing.minutes(compiled, 30_000 * 60 * 5) == 7
-    assert queueing.minutes(other, 3_000 * 60 * 5) == 7
-    assert queueing.minutes(run_config("CartPole-v1", engine="torch"), 300 * 60 * 5) == 7
+    assert slurm.minutes(compiled, 0.0) == 2
+    assert slurm.minutes(compiled, 30_000 * 60 * 5) == 7
+    assert slurm.minutes(other, 3_000 * 60 * 5) == 7
+    assert slurm.minutes(run_config("CartPole-v1", engine="torch"), 300 * 60 * 5) == 7
 
 
 @pytest.mark.parametrize(
     ("minutes", "expected"), [(1, "b"), (12, "b"), (13, "a"), (60, "a"), (61, None), (9999, None)]
 )
 def test_an_entry_holds_as_many_runs_as_two_hours_do(minutes: int, expected: str | None) -> None:
-    assert queueing.entry(minutes, {"a": 2, "b": 10}) == expected
-    assert queueing.entry(minutes, {}) is None
+    assert slurm.entry(minutes, {"a": 2, "b": 10}) == expected
+    assert slurm.entry(minutes, {}) is None
 
 
 @pytest.mark.slow

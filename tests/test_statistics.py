@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented import QUICK, SEEDS, STUDY, expanded, table_for_scores, table_for_tables
 
-from mace_rl.study.compare import aggregate as a
-from mace_rl.study.compare import statistics as s
-from mace_rl.study.compare.comparisons import comparisons
-from mace_rl.study.measure.metrics import all_metrics
+from mace_study.compare import aggregate as a
+from mace_study.compare import statistics as s
+from mace_study.compare.comparisons import comparisons
+from mace_study.measure.metrics import all_metrics
 
 REPETITIONS = 5000
 HOW = 0.95, REPETITIONS

@@ -19,8 +19,8 @@ from shared import refused
 from mace_rl.config.reading import _read, read_options, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
-from mace_rl.study.claims_config import read_claims
-from mace_rl.study.config import LABEL, load_study, read_study
+from mace_study.compare.claims_config import read_claims
+from mace_study.config.study import LABEL, load_study, read_study
 
 CONFIG = Path(__file__).parents[1] / "config.yaml"
 RULES = CONFIG.parent / "workflow" / "rules"
@@ -319,15 +319,15 @@ PLANNED = {"torch", "numba", "pybullet", "pandas", "scipy.stats", "matplotlib.fi
     ("code", "forbidden", "backend"),
     [
         (None, PLANNED, "of a notebook"),  # whatever of this project the rules import
-        ("import mace_rl.study.show.tables", HEAVY | {"gymnasium"}, "agg"),
-        ("import mace_rl.study.compare.comparisons", HEAVY | {"gymnasium"}, "agg"),
+        ("import mace_study.show.tables", HEAVY | {"gymnasium"}, "agg"),
+        ("import mace_study.compare.comparisons", HEAVY | {"gymnasium"}, "agg"),
     ],
 )
 def test_planning_and_tabulating_import_nothing_slow(code, forbidden, backend) -> None:
     rules = [line for rule in RULES.glob("*.smk") for line in rule.read_text("utf-8").splitlines()]
-    planning = [line for line in rules if re.match("(from|import) mace_rl", line)]
+    planning = [line for line in rules if re.match("(from|import) mace_(rl|study)", line)]
     code = "\n".join([code or "\n".join(planning), "import sys; print(*sys.modules)"])
     command, environ = [sys.executable, "-c", code], os.environ | {"MPLBACKEND": backend}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
-    assert "mace_rl.study.metrics_config" in loaded and not loaded & forbidden
+    assert "mace_study.config.metrics" in loaded and not loaded & forbidden

@@ -29,19 +29,19 @@ from invented import (
 )
 
 from mace_rl.config.agent import PPOConfig, TorchModule
-from mace_rl.study.compare import summary
-from mace_rl.study.compare.aggregate import aggregate
-from mace_rl.study.compare.comparisons import comparisons
-from mace_rl.study.compare.verdicts import ledger
-from mace_rl.study.measure.metrics import Metric, all_metrics, metrics_columns
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import tables
-from mace_rl.study.show.latex import latex_cell, table1_latex, table2_latex
-from mace_rl.study.show.markdown import markdown, plain
-from mace_rl.study.show.markdown import page as markdown_page
-from mace_rl.study.show.report import as_html
-from mace_rl.study.show.sections import of_ledger, of_runs, read_data
-from mace_rl.study.show.tables import Cell, Value, estimate, number
+from mace_study.compare import summary
+from mace_study.compare.aggregate import aggregate
+from mace_study.compare.comparisons import comparisons
+from mace_study.compare.verdicts import ledger
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.metrics import Metric, all_metrics, metrics_columns
+from mace_study.show import tables
+from mace_study.show.latex import latex_cell, table1_latex, table2_latex
+from mace_study.show.markdown import markdown, plain
+from mace_study.show.markdown import page as markdown_page
+from mace_study.show.report import as_html
+from mace_study.show.sections import of_ledger, of_runs, read_data
+from mace_study.show.tables import Cell, Value, estimate, number
 
 metrics = partial(table_for_tables, all_metrics(QUICK))
 LABELS = {"ppo": "PPO (Baseline)", "mace_fixed": "MACE-RL (Fixed β)", "mace_full": "MACE-RL (Full)"}

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from shared import ROOT
 
 from mace_rl.environments.tasks import BarrenRegion, DeepSea, NoisyDeepSea
-from mace_rl.study.config import Study, read_study
+from mace_study.config.study import Study, read_study
 
 NORTH, EAST, SOUTH, WEST = range(4)
 

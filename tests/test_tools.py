@@ -17,7 +17,7 @@ from shared import ROOT, Bonanza, message
 from benchmarks import bounds, breakdown, guard, purejaxrl
 from benchmarks.measuring import CARTPOLE, HOPPER
 from mace_rl.runs import run
-from mace_rl.study.config import read_study
+from mace_study.config.study import read_study
 from tools import kept_runs, random_return, tables
 from tools.deposit import DepositError, deposit
 
@@ -212,7 +212,7 @@ def test_what_is_not_committed_is_refused(clone, change):
 @pytest.mark.parametrize("environment", [CARTPOLE, HOPPER])
 @pytest.mark.parametrize("variant", ["ppo", "mace_full"])
 def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, environment, variant):
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     for _, module, name in breakdown.FUNCTIONS:  # put back after the test
         owner = importlib.import_module(module)
@@ -231,7 +231,7 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
 
 def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatch):
     """One update an episode: four epochs of both networks, which see four numbers."""
-    from mace_rl.trainer import Trainer
+    from mace_rl.training.trainer import Trainer
 
     owners = ("improve_policy", "improve_values", "policy_gradients")
     for owner, name in (

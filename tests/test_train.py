@@ -12,12 +12,12 @@ from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.config.reading import merge
-from mace_rl.experience import Experience
-from mace_rl.records import EpisodeRecord
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
-from mace_rl.study.config import read_study
-from mace_rl.trainer import Trainer
+from mace_rl.training.experience import Experience
+from mace_rl.training.records import EpisodeRecord
+from mace_rl.training.trainer import Trainer
+from mace_study.config.study import read_study
 
 SEVERAL = {"rollout_steps": 100, "minibatch_size": 32, "gae_lambda": 0.95}
 AS_THEY_ARE = dict.fromkeys(("normalise_observations", "scale_rewards", "scale_advantages"), False)

@@ -13,16 +13,16 @@ import pytest
 import torch
 from shared import GOOD, LAYER_NORM, call, refusal, refused
 
-from mace_rl import files
+from mace_rl.base import files
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.plugins import code_outside, make
 from mace_rl.config.section import ConfigError
-from mace_rl.records import EpisodeRecord, RecordError
 from mace_rl.runs import verify
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import CheckpointError, archive
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import file_digest
+from mace_rl.training.records import EpisodeRecord, RecordError
 
 PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
 NETWORK = {"kind": "torch", "module": "pydoc:pipepager"}
@@ -91,7 +91,11 @@ def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkey
     "reference",
     [
         *("pydoc:pipepager", "subprocess:call", "os:system", "collections:OrderedDict"),
-        *("mace_rl.runs.provenance:subprocess", "mace_rl.files:write_atomically", "numpy:array"),
+        *(
+            "mace_rl.runs.provenance:subprocess",
+            "mace_rl.base.files:write_atomically",
+            "numpy:array",
+        ),
     ],
 )
 @pytest.mark.parametrize(("kind", "functions"), [(BetaController, False), (torch.nn.Module, True)])

@@ -183,7 +183,7 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     (CONFIG, ', "Acrobot-v1"', "", {"table2": 1, **EVALUATION}),
     ("src/mace_rl/agent/ppo.py", "\n\nimport", "\n\nN = 1\nimport", TRAIN | {"table2": 1}),
     ("src/mace_rl/agent/ppo.py", "\n\nimport", "\n# Of no meaning.\n\nimport", {}),
-    ("src/mace_rl/study/measure/metrics.py", "\n\nimport", "\n\nN = 1\nimport", MEASURED),
+    ("src/mace_study/measure/metrics.py", "\n\nimport", "\n\nN = 1\nimport", MEASURED),
     ("workflow/scripts/train.py", "\n\nimport", "\n\nN = 1\nimport", TRAIN),
     ("workflow/scripts/tables.py", "\n\nfrom", "\n\nN = 1\nfrom", TABLES),
     ("config/claims.yaml", "[140, 660]", "[141, 660]", PAPERS),

@@ -17,6 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import mace_rl.environments  # noqa: F401  (registers ours)
 from extras.random_beta import RandomBeta
+from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.curiosity import Curiosity
@@ -24,11 +25,10 @@ from mace_rl.config.beta import ConstantBeta
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.config.wrappers import CuriosityConfig, defaults
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs.checkpoint import archive
-from mace_rl.streams import Streams
-from mace_rl.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
+from mace_rl.wrapping.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
 
 # So small that buffer and memory get full within a test, and replace what they hold.
 SMALL = {

@@ -15,7 +15,7 @@ import tarfile
 import tomllib
 from pathlib import Path
 
-from mace_rl.files import write_atomically
+from mace_rl.base.files import write_atomically
 from mace_rl.runs.provenance import GitError, git
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import product
 from typing import NamedTuple
 
-import mace_rl.pins  # noqa: F401  # isort: skip
+import mace_rl.base.cpu_features  # noqa: F401  # isort: skip
 
 import numpy as np
 

@@ -28,10 +28,10 @@ from typing import Any, get_type_hints
 
 import numpy as np
 
-from mace_rl import files
-from mace_rl.files import write_atomically
-from mace_rl.records import EpisodeRecord
+from mace_rl.base import files
+from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import FinishedRun
+from mace_rl.training.records import EpisodeRecord
 
 AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
 LONGEST = 60  # seconds of a run in a sample

@@ -17,7 +17,7 @@ import numpy as np
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
-from mace_rl.study.config import load_study
+from mace_study.config.study import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -15,15 +15,15 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mace_rl.study.claims_config import read_claims
-from mace_rl.study.compare.draw import draw, numbers
-from mace_rl.study.compare.ledger import read_ledger
-from mace_rl.study.config import read_study
-from mace_rl.study.show import worlds
-from mace_rl.study.show.curves import PlotStyle, plot_style, quantity, save_figure
-from mace_rl.study.show.markdown import page
-from mace_rl.study.show.sections import Section
-from mace_rl.study.show.tables import side_by_side
+from mace_study.compare.claims_config import read_claims
+from mace_study.compare.ledger import read_ledger
+from mace_study.compare.single_seeds import draw, numbers
+from mace_study.config.study import read_study
+from mace_study.show import worlds
+from mace_study.show.curves import PlotStyle, plot_style, quantity, save_figure
+from mace_study.show.markdown import page
+from mace_study.show.sections import Section
+from mace_study.show.tables import side_by_side
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
 CONFIG = Path("config.yaml")  # every world has its labels, colours and measures ...

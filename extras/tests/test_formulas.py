@@ -12,7 +12,7 @@ from extras.hashing import HashCounts
 from extras.icm import ICM
 from extras.random_beta import RandomBeta
 from extras.rnd import RND
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 
 ACTIONS = {"discrete": Discrete(3), "box": Box(-1, 1, (2,), np.float32)}

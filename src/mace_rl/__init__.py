@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mace_rl.library import settings, train
     from mace_rl.runs.agent import load_agent
-    from mace_rl.wrappers import CuriosityReward, VectorCuriosityReward
+    from mace_rl.wrapping.wrappers import CuriosityReward, VectorCuriosityReward
 
 __all__ = ["CuriosityReward", "VectorCuriosityReward", "load_agent", "settings", "train"]
 
@@ -21,4 +21,4 @@ _PLACES = {"load_agent": "runs.agent", "settings": "library", "train": "library"
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'mace_rl' has no attribute {name!r}")
-    return getattr(import_module(f"mace_rl.{_PLACES.get(name, 'wrappers')}"), name)
+    return getattr(import_module(f"mace_rl.{_PLACES.get(name, 'wrapping.wrappers')}"), name)

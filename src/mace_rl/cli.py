@@ -1,6 +1,6 @@
 """The command `mace-rl`: train one run, evaluate or film its agent, export records, repeat runs."""
 
-import mace_rl.pins  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
+import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
 
 import argparse
 import logging
@@ -11,13 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mace_rl import files, outlets
+from mace_rl.base import files, stdio
+from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.library import settings
-from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun, finished
-from mace_rl.study.config import folder_of
 
 logger = logging.getLogger(__name__)
 
@@ -130,7 +129,9 @@ def run_config(arguments: argparse.Namespace) -> RunConfig:
 
 def train(arguments: argparse.Namespace) -> None:
     config = run_config(arguments)
-    default = Path("runs", folder_of(config.environment), config.variant, f"seed{config.seed}")
+    default = Path(
+        "runs", files.folder_of(config.environment), config.variant, f"seed{config.seed}"
+    )
     out: Path = arguments.out or default
     if not arguments.restart and finished(config, out):
         if (out / files.CHECKPOINT).exists():  # killed between the two
@@ -219,7 +220,7 @@ def in_a_file(error: Exception) -> str:
 
 def main() -> None:
     """Entry point; exits with 1 and one line on standard error for what cannot be done."""
-    outlets.secure()
+    stdio.secure()
     arguments = parser().parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:

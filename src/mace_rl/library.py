@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, short_repr
-from mace_rl.records import EpisodeRecord
+from mace_rl.run_settings import read_settings
 from mace_rl.runs.finished import FinishedRun, finished
-from mace_rl.study.config import read_study
+from mace_rl.training.records import EpisodeRecord
 
 if TYPE_CHECKING:
     from mace_rl.runs.agent import Agent
@@ -51,11 +51,11 @@ def settings(
         if not isinstance(value, str):
             raise ConfigError(f"{name} is {short_repr(value)}, but should be a name")
     over = [config] if isinstance(config, str | Path) else config
-    study = read_study([DEFAULTS, *map(Path, over)], every_run=False)
+    known = read_settings([DEFAULTS, *map(Path, over)])
     try:
-        return study.run_config(environment, variant, seed, changes)
+        return known.run_config(environment, variant, seed, changes)
     except ConfigError as error:
-        if variant in study.variant_settings:
+        if variant in known.variant_settings:
             raise
         raise ConfigError(
             f"{error}; variants of further studies need --config FILE, or config=FILE"

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.gauge import WINDOWS, Gauge
 from mace_rl.config.run import RunConfig
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
+from mace_rl.library import settings
 from mace_rl.numerics.arrays import total
-from mace_rl.state import Stateful
-from mace_rl.study.config import read_study
-from mace_rl.trainer import Trainer
+from mace_rl.training.trainer import Trainer
 from tools.meta.tasks import Generated
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +84,7 @@ def task_config(number: int) -> RunConfig:
     if kind == "sea":
         limit = size + 4 * (arguments["door"] == "end" and arguments["pages"] > 0)
     rate = float(rng.choice([0.0007, 0.001, 0.002]))
-    changes = {
+    changes: dict[str, Any] = {
         "episodes": int(rng.choice([400, 600, 900])),
         "environment_arguments": arguments,
         "max_episode_steps": limit,
@@ -96,8 +96,7 @@ def task_config(number: int) -> RunConfig:
             "critic_learning_rate": 3 * rate,
         },
     }
-    study = read_study([ROOT / "config.yaml"], every_run=False)
-    return study.run_config("Generated-v0", "mace_fixed", 0, changes)
+    return settings("Generated-v0", "mace_fixed", **changes)
 
 
 def constant(beta: float, gauge: Gauge) -> float:

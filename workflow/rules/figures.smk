@@ -24,7 +24,7 @@ rule figure:
         "../scripts/figure.py"
 
 
-# Of all runs at once, or of the ledger: `PICTURES` of mace_rl.study.show.pictures.
+# Of all runs at once, or of the ledger: `PICTURES` of mace_study.show.pictures.
 rule picture:
     input:
         unpack(

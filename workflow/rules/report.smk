@@ -1,6 +1,6 @@
 # One page of everything to read; Snakemake's own (`--report`) has the outputs one by one.
 
-from mace_rl.sources import PACKAGE
+from mace_rl.base.code_digest import PACKAGE
 
 PICTURED = ["figure1", "figure1_seeds", "figure2", "figure2_seeds", *READ]
 
@@ -28,7 +28,7 @@ rule page:
         },
         ppo=ppo_settings(),
         own=own_code(),
-        template=provenance.file_digest(PACKAGE / "study" / "show" / "report.html"),
+        template=provenance.file_digest(PACKAGE.parent / "mace_study" / "show" / "report.html"),
         code=code("page.py", MEASURED),
     script:
         "../scripts/page.py"

@@ -1,6 +1,6 @@
 # The study as the configuration describes it, checked, and what all rules share of it.
 
-import mace_rl.pins  # before NumPy: equal bits on every processor; the jobs inherit it
+import mace_rl.base.cpu_features  # before NumPy: equal bits on every processor; the jobs inherit it
 import json
 import os
 import re
@@ -9,16 +9,16 @@ import sys
 from functools import reduce
 from pathlib import Path
 
-from mace_rl import files
+from mace_rl.base import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
-from mace_rl.study.config import folder_of, load_study
+from mace_study.config.study import load_study
 from mace_rl.config.plugins import code_outside, source_files
 from mace_rl.environments import registered
-from mace_rl.study.claims_config import FEWEST_SEEDS, read_claims, too_few
-from mace_rl.study.measure.metrics import all_metrics
-from mace_rl.runs import provenance, queueing
-from mace_rl.sources import digest
+from mace_study.compare.claims_config import FEWEST_SEEDS, read_claims, too_few
+from mace_study.measure.metrics import all_metrics
+from mace_rl.runs import provenance, slurm
+from mace_rl.base.code_digest import digest
 
 # Snakemake pastes this path into the shell commands of `script:` jobs, where a space would split it.
 sys.executable = shlex.quote(sys.executable)
@@ -47,8 +47,8 @@ except ConfigError as error:
 RESULTS = os.path.normpath(study.results)
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 RUNS = study.runs()
-FOLDERS = {folder_of(env): env for env in study.environments}
-MADE = [RUN.format(env=folder_of(env), variant=name, seed=seed) for env, name, seed in RUNS]
+FOLDERS = {files.folder_of(env): env for env in study.environments}
+MADE = [RUN.format(env=files.folder_of(env), variant=name, seed=seed) for env, name, seed in RUNS]
 EPISODES, RECORDS = ([f"{run}/{file}" for run in MADE] for file in (files.EPISODES, files.RECORD))
 HAS_PAPERS = paper.table1.is_within(study.environments, study.variants)
 # What counts episodes can be read in several ways.
@@ -128,12 +128,12 @@ def most_work(wildcards):
 
 def minutes(wildcards):
     """The time to ask a cluster for."""
-    return queueing.minutes(run_config(wildcards), most_work(wildcards))
+    return slurm.minutes(run_config(wildcards), most_work(wildcards))
 
 
 def queue_entry(wildcards):
     """The group whose runs share entries of a cluster's queue; None without a cluster's profile."""
-    return queueing.entry(minutes(wildcards), workflow.group_settings.group_components)
+    return slurm.entry(minutes(wildcards), workflow.group_settings.group_components)
 
 
 def code(script, settings=None):

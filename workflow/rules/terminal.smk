@@ -71,7 +71,7 @@ def outcome():
     if f"{RESULTS}/table1.csv" in made:
         import pandas  # only now: it takes as long as planning
 
-        from mace_rl.study.show import markdown, tables
+        from mace_study.show import markdown, tables
 
         names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
         data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
@@ -94,7 +94,7 @@ def outcome():
 
 
 def title():
-    from mace_rl.study.show.tables import counts_episodes
+    from mace_study.show.tables import counts_episodes
 
     name = f"Table 1: {paper.table1.caption[0].lower()}{paper.table1.caption[1:]}"
     if not counts_episodes(MEASURED, paper.table1):

@@ -4,15 +4,15 @@ from pathlib import Path
 
 from job import job
 
-from mace_rl.files import write_atomically
-from mace_rl.records import read_table
+from mace_rl.base.files import write_atomically
 from mace_rl.runs.provenance import read_record
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.compare import ledger, verdicts
-from mace_rl.study.measure.betas import betas_columns
-from mace_rl.study.measure.metrics import read_metrics
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import markdown, sections
+from mace_rl.training.records import read_table
+from mace_study.compare import ledger, verdicts
+from mace_study.compare.claims_config import parse_claims
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.betas import betas_columns
+from mace_study.measure.metrics import read_metrics
+from mace_study.show import markdown, sections
 
 with job(snakemake):
     found, given = snakemake.input, snakemake.params

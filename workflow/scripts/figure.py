@@ -2,10 +2,10 @@
 
 from job import job
 
-from mace_rl.files import write_atomically
+from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import read_runs
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import curves
+from mace_study.config.metrics import MetricsConfig
+from mace_study.show import curves
 
 with job(snakemake):
     given, output = snakemake.params, snakemake.output

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mace_rl import outlets
+from mace_rl.base import stdio
 
 PATIENCE = 1.0  # seconds between looks at whether Snakemake is alive
 
@@ -29,7 +29,7 @@ def job(snakemake: Any) -> Iterator[None]:
     # Without this a training goes on unseen when Snakemake is killed.
     if "MACE_RL_SNAKEMAKE_PID" in os.environ:
         threading.Thread(target=_end_with_snakemake, daemon=True).start()
-    outlets.secure()  # or the log gets the number of one that is closed
+    stdio.secure()  # or the log gets the number of one that is closed
     with open(snakemake.log[0], "a", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)

@@ -4,12 +4,12 @@ from pathlib import Path
 
 from job import job
 
+from mace_rl.base.files import write_atomically
 from mace_rl.config.agent import PPOConfig
-from mace_rl.files import write_atomically
 from mace_rl.runs.provenance import read_record
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import animations, curves, report, sections
+from mace_study.compare.claims_config import parse_claims
+from mace_study.config.metrics import MetricsConfig
+from mace_study.show import animations, curves, report, sections
 
 with job(snakemake):
     found, given, output = snakemake.input, snakemake.params, Path(snakemake.output[0]).absolute()

@@ -2,11 +2,11 @@
 
 from job import job
 
-from mace_rl.files import write_atomically
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import curves, pictures
-from mace_rl.study.show.sections import read_data
+from mace_rl.base.files import write_atomically
+from mace_study.compare.claims_config import parse_claims
+from mace_study.config.metrics import MetricsConfig
+from mace_study.show import curves, pictures
+from mace_study.show.sections import read_data
 
 with job(snakemake):
     given, output = snakemake.params, snakemake.output

@@ -2,12 +2,12 @@
 
 from job import job
 
-from mace_rl.files import write_atomically
+from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import read_runs
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.compare.readings import readings
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import curves, pictures
+from mace_study.compare.claims_config import parse_claims
+from mace_study.compare.readings import readings
+from mace_study.config.metrics import MetricsConfig
+from mace_study.show import curves, pictures
 
 with job(snakemake):
     found, given, output = snakemake.input, snakemake.params, snakemake.output

@@ -2,10 +2,10 @@
 
 from job import job
 
+from mace_rl.base.files import write_atomically
 from mace_rl.config.agent import PPOConfig
-from mace_rl.files import write_atomically
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.show.latex import table2_latex
+from mace_study.compare.claims_config import parse_claims
+from mace_study.show.latex import table2_latex
 
 with job(snakemake):
     paper = parse_claims(snakemake.input.claims).table2

@@ -2,14 +2,14 @@
 
 from job import job
 
-from mace_rl.files import write_atomically
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.compare.aggregate import aggregate
-from mace_rl.study.compare.comparisons import comparisons
-from mace_rl.study.compare.summary import split, summary
-from mace_rl.study.measure.metrics import read_metrics
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show.latex import table1_latex
+from mace_rl.base.files import write_atomically
+from mace_study.compare.aggregate import aggregate
+from mace_study.compare.claims_config import parse_claims
+from mace_study.compare.comparisons import comparisons
+from mace_study.compare.summary import split, summary
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.metrics import read_metrics
+from mace_study.show.latex import table1_latex
 
 with job(snakemake):
     given, output = snakemake.params, snakemake.output

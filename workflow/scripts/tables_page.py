@@ -2,10 +2,10 @@
 
 from job import job
 
-from mace_rl.files import write_atomically
-from mace_rl.study.claims_config import parse_claims
-from mace_rl.study.metrics_config import MetricsConfig
-from mace_rl.study.show import markdown, sections
+from mace_rl.base.files import write_atomically
+from mace_study.compare.claims_config import parse_claims
+from mace_study.config.metrics import MetricsConfig
+from mace_study.show import markdown, sections
 
 with job(snakemake):
     given, paper = snakemake.params, parse_claims(snakemake.input.claims)

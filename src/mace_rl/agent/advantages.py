@@ -4,7 +4,7 @@ import numpy as np
 
 from mace_rl.numerics.arrays import mean, root_mean_square
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.products import dot
+from mace_rl.numerics.matmul import dot
 
 
 @kernel

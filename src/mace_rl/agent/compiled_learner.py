@@ -1,7 +1,7 @@
 """PPO's update in compiled code: K epochs over the minibatches in one call for each network.
 
 It computes what `TorchLearner` does, with gradients written out. A minibatch goes through the
-network in blocks that fit into the nearest cache: `products` continue the sum over steps.
+network in blocks that fit into the nearest cache: `matmul` continue the sum over steps.
 """
 
 import math
@@ -13,16 +13,16 @@ import numpy as np
 from mace_rl.agent.distribution import log_prob_gradient, log_probs
 from mace_rl.agent.learner import Batch, Minibatches, Update, parameters_of
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, Policy
+from mace_rl.base.state import Stateful
 from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.adam import Adam, step
 from mace_rl.numerics.arrays import mean
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import exp, f32
+from mace_rl.numerics.matmul import padded
 from mace_rl.numerics.network import CompiledMLP
 from mace_rl.numerics.network_kernels import activation_buffer, backward, forward, transposed
 from mace_rl.numerics.normaliser import Normalisation
-from mace_rl.numerics.products import padded
-from mace_rl.state import Stateful
 
 BLOCK = 64  # steps; 32 to 128 are as fast
 

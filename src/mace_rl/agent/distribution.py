@@ -8,7 +8,7 @@ import numpy as np
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import HALF_LOG_TAU, exp, f32, log
-from mace_rl.numerics.products import padded
+from mace_rl.numerics.matmul import padded
 
 
 @kernel

@@ -10,12 +10,12 @@ from mace_rl.agent.advantages import episode_advantages
 from mace_rl.agent.learner import Batch, Learner, Minibatches, Update
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
+from mace_rl.base.state import Stateful
 from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.arrays import in_order, shuffled
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation, RunningNormaliser
-from mace_rl.state import Stateful
 
 TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.numerics.compiling import kernel
+from mace_rl.numerics.matmul import dot
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.numerics.products import dot
-from mace_rl.state import Stateful
 
 
 class RewardScale(Stateful):

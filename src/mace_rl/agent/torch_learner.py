@@ -11,11 +11,11 @@ from torch.nn.utils import clip_grad_norm_
 from mace_rl.agent.learner import Batch, Minibatches, Update, parameters_of
 from mace_rl.agent.policy import ActingPolicy, NetworkActing, Policy
 from mace_rl.agent.torch_policy import TorchPolicy
+from mace_rl.base.state import Stateful
 from mace_rl.config.agent import PPOConfig
 from mace_rl.numerics.adam import EPSILON
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation
-from mace_rl.state import Stateful
 
 
 class TorchLearner(Stateful):

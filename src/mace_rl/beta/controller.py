@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 
 
 class Effect(NamedTuple):

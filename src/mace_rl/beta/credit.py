@@ -13,10 +13,10 @@ import math
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import Effect
 from mace_rl.config.beta import CreditConfig, PretrainedConfig
-from mace_rl.numerics.products import dot
-from mace_rl.state import Stateful
+from mace_rl.numerics.matmul import dot
 
 SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
 

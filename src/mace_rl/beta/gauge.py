@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.numerics.elementary import log
-from mace_rl.state import Stateful
 
 WINDOWS = 100  # of a training, each as many episodes
 TREND = 5  # windows back with which the bonus is compared

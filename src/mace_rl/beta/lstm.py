@@ -11,7 +11,7 @@ import numpy as np
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import f32, fma, sigmoid, tanh
-from mace_rl.numerics.products import add_product, product
+from mace_rl.numerics.matmul import add_product, product
 
 
 class MetaNetwork(NamedTuple):

@@ -12,16 +12,16 @@ from collections import deque
 import numpy as np
 from gymnasium.spaces import Discrete
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController, Effect
 from mace_rl.beta.credit import Judge
 from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork, TorchMetaNetwork
 from mace_rl.beta.squash import beta_of, logit, natural_log
 from mace_rl.config.beta import MetaConfig
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.normaliser import RunningNormaliser, standardised
-from mace_rl.state import Stateful
 
 CLIP = 5.0  # bound of what the LSTM reads, in standard deviations
 SIZE_DECAY = 0.99  # of the running mean that says how large outputs usually are, per credit

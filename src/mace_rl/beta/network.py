@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, from_numpy
 from torch.nn.utils import clip_grad_norm_
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states, read_out
 from mace_rl.config.beta import MetaConfig
 from mace_rl.numerics.adam import EPSILON, Adam, step
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import f32
-from mace_rl.state import Stateful
 
 
 class LearningNetwork(Protocol):

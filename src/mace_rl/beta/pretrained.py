@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController, Effect
 from mace_rl.beta.credit import Integrator, Judge
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit, read_network
 from mace_rl.beta.squash import beta_of, logit
 from mace_rl.config.beta import PretrainedConfig
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import total
-from mace_rl.state import Stateful
 
 WEIGHTS = Path(__file__).with_name("weights.npz")  # tools/meta made them
 

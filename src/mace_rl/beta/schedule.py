@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.beta import ConstantBeta, ExponentialBeta
-from mace_rl.environments.rollout import Episode
-from mace_rl.state import Stateful
+from mace_rl.environments.episode import Episode
 
 
 class ExponentialSchedule(Stateful, BetaController):

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from mace_rl.base.rng import Streams
+from mace_rl.base.state import Stateful
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
 from mace_rl.bonus.novelty import novelty
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
-from mace_rl.environments.rollout import Episode
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.finite import numbers
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.state import Stateful
-from mace_rl.streams import Streams
 
 SMALLEST_SPREAD = 0.01  # of reward: where returns differ by less, nothing is unproductive
 

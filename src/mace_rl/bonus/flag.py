@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.bonus.novelty import Novelty
-from mace_rl.state import Stateful
 
 
 class FlagNovelty(Stateful, Novelty):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mace_rl.environments.rollout import Episode
-from mace_rl.state import HasState
+from mace_rl.base.state import HasState
+from mace_rl.environments.episode import Episode
 
 
 class Bonus(NamedTuple):

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.config.bonus import MemoryConfig
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.nearest import Neighbours
-from mace_rl.state import Stateful
 
 
 class EpisodicMemory(Stateful):

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from mace_rl.base.rng import Streams
+from mace_rl.base.state import HasState, Stateful
 from mace_rl.bonus.density import DensityEstimator
 from mace_rl.config.bonus import NoveltyConfig
 from mace_rl.config.plugins import make
@@ -18,8 +20,6 @@ from mace_rl.numerics.elementary import exp, fma
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.nearest import Neighbours
 from mace_rl.numerics.normaliser import RunningNormaliser, standardised
-from mace_rl.state import HasState, Stateful
-from mace_rl.streams import Streams
 
 KNOWN = 0.9  # the share of visited states that count as known
 

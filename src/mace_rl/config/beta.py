@@ -5,7 +5,8 @@ from typing import Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from mace_rl.config.section import Arguments, Count, Reference, Section
-from mace_rl.records import LARGEST_BETA
+
+LARGEST_BETA = 10.0  # the paper has at most 1; larger constants are there to compare
 
 
 class CreditConfig(Section):

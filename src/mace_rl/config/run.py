@@ -47,7 +47,9 @@ class AgentConfig(Section):
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
     environment_arguments: EnvironmentArguments = Field(default={})  # for its constructor
-    trainer: Literal["published"] | None = None  # `mace_rl.published`; None: `mace_rl.trainer`
+    trainer: Literal["published"] | None = (
+        None  # None: `training.trainer`; else `training.published`
+    )
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     published: PublishedConfig | None = None

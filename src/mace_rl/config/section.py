@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from mace_rl.refusal import Refusal
+from mace_rl.base.errors import Refusal
 
 Model = TypeVar("Model", bound=BaseModel)
 MOVED = ("icm", "rnd", "hash_counts", "random", "bandit")  # kinds that are plugins now

@@ -1,4 +1,4 @@
-"""The settings of `mace_rl.wrappers`."""
+"""The settings of `mace_rl.wrapping.wrappers`."""
 
 from collections.abc import Mapping
 from functools import cache

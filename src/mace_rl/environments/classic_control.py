@@ -1,13 +1,10 @@
-"""CartPole-v1 and Acrobot-v1 in compiled code: whole episodes, equal to Gymnasium's to the bit.
+"""Steps of CartPole-v1 and Acrobot-v1 in compiled code, equal to Gymnasium's to the bit.
 
 All arithmetic is in Gymnasium's order.
 """
 
 import math
 
-import numpy as np
-
-from mace_rl.agent.policy import act_discrete
 from mace_rl.numerics.compiling import njit
 
 CARTPOLE, ACROBOT = 0, 1
@@ -95,7 +92,7 @@ def step_acrobot(state, action, two):
 
 
 @njit(cache=True)
-def _observe(which, state, observation):
+def observe(which, state, observation):
     if which == CARTPOLE:
         for i in range(4):
             observation[i] = state[i]
@@ -103,30 +100,3 @@ def _observe(which, state, observation):
         observation[0], observation[1] = math.cos(state[0]), math.sin(state[0])
         observation[2], observation[3] = math.cos(state[1]), math.sin(state[1])
         observation[4], observation[5] = state[2], state[3]
-
-
-@njit(cache=True)
-def episode(which, state, first_observation, policy, uniforms):
-    """One whole episode of CartPole (`which` = 0) or Acrobot (1) from a reset environment's state.
-
-    state: float64 [4], overwritten; policy: a `CompiledActing`; uniforms: float64 [time limit], one
-    a step. Returns the fields of an `Episode`.
-    """
-    limit = uniforms.shape[0]
-    two = np.full(1, 2.0)[0]
-    observations = np.empty((limit + 1, first_observation.shape[0]), np.float32)
-    actions = np.empty(limit, np.int64)
-    log_probs = np.empty(limit, np.float32)
-    rewards = np.empty(limit, np.float64)
-    observations[0] = first_observation
-    terminated = False
-    t = 0
-    while t < limit and not terminated:
-        actions[t], log_probs[t] = act_discrete(observations[t], policy, uniforms[t])
-        if which == CARTPOLE:
-            rewards[t], terminated = step_cartpole(state, actions[t])
-        else:
-            rewards[t], terminated = step_acrobot(state, actions[t], two)
-        t += 1
-        _observe(which, state, observations[t])
-    return observations[: t + 1], actions[:t], log_probs[:t], rewards[:t], terminated

@@ -12,11 +12,11 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from mace_rl.base.stdio import keep_open
 from mace_rl.config.plugins import import_module
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
-from mace_rl.outlets import keep_open
 
 # Faster classes that behave the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.products import dot
-from mace_rl.state import Stateful
+from mace_rl.numerics.matmul import dot
 
 DECAY_MEAN, DECAY_SQUARE, EPSILON = 0.9, 0.999, 1e-5  # β₁, β₂ and ε
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.products import dot
+from mace_rl.numerics.matmul import dot
 
 
 @kernel

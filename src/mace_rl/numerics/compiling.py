@@ -1,7 +1,7 @@
-"""numba's `njit`, with a cache on disk that notices every edit of what trains.
+"""numba's `njit`, with a cache on disk that notices every edit of kernels.
 
-numba's own notices edits only in the file of the cached function. So each version of what a
-training depends on gets its own folder, which is set only while a function of ours is decorated.
+numba's own notices edits only in the file of the cached function. So each version of what kernels
+come from gets its own folder, which is set only while a function of ours is decorated.
 """
 
 import logging
@@ -15,8 +15,8 @@ from typing import Any
 
 import numba
 
-from mace_rl.refusal import Refusal
-from mace_rl.sources import PACKAGE, training_bytes
+from mace_rl.base.code_digest import PACKAGE, kernels
+from mace_rl.base.errors import Refusal
 
 config: Any = numba.config  # which it fills as it is imported
 if config.DISABLE_JIT:
@@ -24,7 +24,7 @@ if config.DISABLE_JIT:
 # If this cannot be written, numba takes the user's folder for caches. config.CACHE_DIR is not read:
 # a .numba_config.yaml in the current folder sets it, and what is there is run.
 FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__" / "numba")
-FOLDER /= training_bytes()[:16]
+FOLDER /= kernels()[:16]
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from mace_rl.base.errors import Refusal
 from mace_rl.numerics.compiling import njit
-from mace_rl.refusal import Refusal
 
 # For rewards and numbers in observations: float32 loses ordinary rewards beside larger ones, and
 # sums of larger squares overflow.

@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import bits_of, float_of, unary
-from mace_rl.numerics.products import LANES, VECTOR, address, everywhere, fused
+from mace_rl.numerics.matmul import LANES, VECTOR, address, everywhere, fused
 
 VECTORS = 4
 BLOCK = VECTORS * LANES  # points whose distances are computed at once

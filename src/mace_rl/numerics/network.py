@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mace_rl.numerics import network_kernels as kernels
-from mace_rl.numerics.products import padded
+from mace_rl.numerics.matmul import padded
 
 
 class Network(Protocol):

@@ -5,7 +5,7 @@ arithmetic is float32 in a fixed order: the same bits on every processor, for on
 
 A network is a flat vector of parameters and its sizes, int64 [layers + 1]. A layer's parameters are
 its weights and, as the last row, its biases, [in + 1, padded out]: columns of zeros are added up to
-a multiple of 16, for `products`. Their gradient is 0, so they stay zeros.
+a multiple of 16, for `matmul`. Their gradient is 0, so they stay zeros.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import f32, tanh
-from mace_rl.numerics.products import Matrix, add_product, address, by_tiles, dot, padded, product
+from mace_rl.numerics.matmul import Matrix, add_product, address, by_tiles, dot, padded, product
 
 FEW = 4  # columns of a last layer; a tile computes 16 at once
 

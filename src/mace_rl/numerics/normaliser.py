@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mace_rl.base.state import Stateful
 from mace_rl.numerics.compiling import kernel
-from mace_rl.state import Stateful
 
 
 class RunningNormaliser(Stateful):

@@ -14,17 +14,18 @@ from gymnasium.spaces import Space
 from torch import Tensor
 from torch.distributions import Distribution
 
-from mace_rl import files, published
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
+from mace_rl.base import files
+from mace_rl.base.rng import Streams
 from mace_rl.config.run import AgentConfig
-from mace_rl.factories import actor_critic, environment
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
-from mace_rl.streams import Streams
+from mace_rl.training import published
+from mace_rl.training.factories import actor_critic, environment
 
 
 class PolicyModule(TorchPolicy):

@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 
-from mace_rl import files
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
+from mace_rl.base.files import write_atomically
 from mace_rl.config.section import short_repr
-from mace_rl.files import write_atomically
-from mace_rl.refusal import Refusal
 
 TENSORS = (torch.Tensor, torch.nn.Parameter)
 PLAIN = (*TENSORS, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)

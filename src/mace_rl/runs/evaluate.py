@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mace_rl.environments.resuming import seeded
-from mace_rl.environments.rollout import draw_noise, rollout_for
 from mace_rl.numerics.arrays import total
 from mace_rl.runs.agent import Player
 from mace_rl.runs.finished import FinishedRun
+from mace_rl.training.resuming import seeded
+from mace_rl.training.rollout import draw_noise, rollout_for
 
 
 def evaluate(

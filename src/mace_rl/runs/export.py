@@ -4,10 +4,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from mace_rl import files
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
+from mace_rl.base.files import write_atomically
 from mace_rl.config.run import IDENTITY
-from mace_rl.files import write_atomically
-from mace_rl.refusal import Refusal
 from mace_rl.runs.finished import FinishedRun
 
 RUN = ("task", "algorithm", "seed", "folder")  # environment, variant, seed, where the run is

@@ -8,11 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
-from mace_rl import files, sources
+from mace_rl.base import code_digest, files
 from mace_rl.config.plugins import code_outside
 from mace_rl.config.run import IDENTITY, AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
-from mace_rl.records import (
+from mace_rl.runs.provenance import difference, identity, read_record
+from mace_rl.training.records import (
     ALTERED,
     EpisodeRecord,
     RecordError,
@@ -21,7 +22,6 @@ from mace_rl.records import (
     check_episodes,
     read_episodes,
 )
-from mace_rl.runs.provenance import difference, identity, read_record
 
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
@@ -71,7 +71,7 @@ class FinishedRun:
         try:
             config = check(model, values, origin)
         except ConfigError as error:
-            if self.record["sources"] == sources.digest("training"):
+            if self.record["sources"] == code_digest.digest("training"):
                 raise
             reason = f"{error}; this run may be of other code, which took other settings"
             raise ConfigError(reason) from None

@@ -9,8 +9,8 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from torch import Tensor
 
+from mace_rl.base.errors import Refusal
 from mace_rl.config.section import short_repr
-from mace_rl.refusal import Refusal
 
 
 class ObservationError(Refusal, ValueError):

@@ -18,7 +18,7 @@ from typing import Any, TextIO
 
 from pydantic import BaseModel, ConfigDict
 
-from mace_rl import files
+from mace_rl.base import files
 from mace_rl.config.section import ConfigError, check
 
 FILE_SECONDS = 30.0  # between the lines of `line` in a file

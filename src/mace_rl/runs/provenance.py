@@ -13,12 +13,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from mace_rl import sources
+from mace_rl.base import code_digest
+from mace_rl.base.errors import Refusal
+from mace_rl.base.files import content
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check, short_repr
-from mace_rl.files import content
-from mace_rl.refusal import Refusal
 
 # The packages whose version can change a result.
 PACKAGES = (
@@ -66,7 +66,7 @@ def identity(config: RunConfig) -> dict[str, Any]:
     return {
         "config": config.settings(),
         "versions": versions(),
-        "sources": sources.digest("training", *own),  # the user's own code included
+        "sources": code_digest.digest("training", *own),  # the user's own code included
     }
 
 
@@ -99,7 +99,7 @@ def versions() -> dict[str, str]:
 
 def git_state() -> dict[str, Any]:
     """Commit of this package's checkout, and whether tracked files differ; None without one."""
-    root = sources.PACKAGE.resolve().parents[1]
+    root = code_digest.PACKAGE.resolve().parents[1]
     try:
         git(root, "ls-files", "--error-unmatch", "src/mace_rl/runs/provenance.py")
         return {

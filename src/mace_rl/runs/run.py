@@ -17,20 +17,20 @@ import scipy.linalg.cython_blas  # noqa: F401  (numba loads it: before threads a
 import torch
 from threadpoolctl import threadpool_limits
 
-from mace_rl import files
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
+from mace_rl.base.files import write_atomically
+from mace_rl.base.rng import Streams
 from mace_rl.config.run import IDENTITY, RunConfig
-from mace_rl.environments import resuming
-from mace_rl.environments.resuming import seeded
-from mace_rl.environments.rollout import fallback_reason
-from mace_rl.files import write_atomically
-from mace_rl.published import PublishedTrainer
-from mace_rl.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
-from mace_rl.refusal import Refusal
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.finished import WAY_OUT, finished, otherwise
-from mace_rl.streams import Streams
-from mace_rl.trainer import Trainer
+from mace_rl.training import resuming
+from mace_rl.training.published import PublishedTrainer
+from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
+from mace_rl.training.resuming import seeded
+from mace_rl.training.rollout import fallback_reason
+from mace_rl.training.trainer import Trainer
 
 logger = logging.getLogger(__name__)
 

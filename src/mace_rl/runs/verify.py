@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mace_rl import files
-from mace_rl.refusal import Refusal
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import difference
 

@@ -14,10 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
-from mace_rl.environments.resuming import seeded
-from mace_rl.environments.rollout import draw_noise, roll_out
 from mace_rl.runs.agent import Player
 from mace_rl.runs.finished import FinishedRun
+from mace_rl.training.resuming import seeded
+from mace_rl.training.rollout import draw_noise, roll_out
 
 # pygame draws into memory: it should not look for a screen or a loudspeaker.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

@@ -1,0 +1,1 @@
+"""What everything stands on: errors, files, standard output, random streams, saved state."""

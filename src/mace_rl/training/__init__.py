@@ -1,0 +1,1 @@
+"""The method: read `trainer.py` first."""

@@ -1,0 +1,121 @@
+"""The parts of a run, made from its settings: what sets β, the bonus, the environment, PPO."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from mace_rl.agent.compiled_learner import CompiledLearner
+from mace_rl.agent.custom import custom_module
+from mace_rl.agent.learner import Learner
+from mace_rl.agent.policy import Policy
+from mace_rl.agent.ppo import PPO, ActorCritic
+from mace_rl.agent.torch_learner import TorchLearner
+from mace_rl.base.rng import Streams
+from mace_rl.beta.controller import BetaController
+from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.beta.pretrained import PretrainedAdaptation
+from mace_rl.beta.schedule import Constant, ExponentialSchedule
+from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.bonus.intrinsic import IntrinsicReward
+from mace_rl.config.agent import TorchModule
+from mace_rl.config.beta import (
+    BetaRule,
+    ConstantBeta,
+    CustomBeta,
+    ExponentialBeta,
+    MetaBeta,
+    NoBonus,
+    PretrainedBeta,
+)
+from mace_rl.config.bonus import CuriosityBonus, CustomBonus
+from mace_rl.config.plugins import make
+from mace_rl.config.run import AgentConfig, RunConfig
+from mace_rl.environments.environment import Environment
+from mace_rl.environments.spaces import Spaces
+from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
+from mace_rl.numerics.normaliser import RunningNormaliser
+
+
+def beta_controller(
+    config: RunConfig, environment: Environment, streams: Streams
+) -> BetaController | None:
+    """What sets β in this variant; None for plain PPO."""
+    match config.beta:
+        case NoBonus():
+            return None
+        case MetaBeta(initial=initial):
+            assert config.meta is not None  # `RunConfig` checked that
+            own = environment, config.engine, streams["meta"]
+            return MetaAdaptation(config.meta, initial, *own)
+        case PretrainedBeta(initial=initial):
+            assert config.pretrained is not None
+            return PretrainedAdaptation(config.pretrained, initial, config.episodes)
+        case rule:
+            return beta_rule(rule, streams["beta"])
+
+
+def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
+    """What sets β, unless it is learned from policy gradients."""
+    match settings:
+        case ConstantBeta():
+            return Constant(settings)
+        case ExponentialBeta():
+            return ExponentialSchedule(settings)
+        case CustomBeta(rule=rule, arguments=arguments):
+            return make(rule, "beta.rule", BetaController, False, generator, **arguments)
+
+
+def intrinsic_reward(
+    config: RunConfig, environment: Environment, streams: Streams
+) -> IntrinsicReward | None:
+    """The bonus that β weighs: curiosity, or a user's own; None in plain PPO."""
+    match config.bonus:
+        case None:
+            return None
+        case CuriosityBonus():
+            assert config.novelty is not None
+            space, size = environment.observation_space, environment.observation_size
+            return Curiosity(config.memory, config.novelty, space, size, streams)
+        case CustomBonus(estimator=estimator, arguments=arguments):
+            key, own = "bonus.estimator", (environment, streams["bonus"])
+            return make(estimator, key, IntrinsicReward, False, *own, **arguments)
+
+
+def environment(config: AgentConfig, streams: Streams) -> Environment:
+    """The environment that the agent acts in."""
+    limits = config.max_episode_steps, config.environment_arguments
+    made = Environment(config.environment, streams.sequence("environment"), *limits)
+    made.clips_actions = config.ppo.clip_actions
+    return made
+
+
+def actor_critic(
+    config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams
+) -> ActorCritic:
+    """The untrained policy and critics, one for each kind of reward."""
+    settings, size = config.ppo, spaces.observation_size
+    own = settings.network if isinstance(settings.network, TorchModule) else None
+
+    def module(outputs: int, output_gain: float, stream: str) -> torch.nn.Module:
+        generator = streams[stream]
+        if own is not None:
+            return custom_module(own, settings.hidden_units, size, outputs, generator)
+        return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
+
+    network: Callable[[Any], Any] = CompiledMLP
+    learner: type[Learner] = CompiledLearner
+    if own is not None or config.engine == "torch":
+        network, learner = TorchNetwork, TorchLearner
+    # With a small last layer the policy starts near uniform, or with means near 0.
+    actor = network(module(spaces.action_size, 0.01, "actor"))
+    policy = Policy(actor, spaces.action_space, settings.initial_log_std)
+    kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
+    critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
+    return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
+
+
+def ppo(config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:
+    """Policy and critics with their learner."""
+    return PPO(actor_critic(config, spaces, intrinsic, streams), streams["minibatches"])

@@ -1,0 +1,152 @@
+"""The state of an environment: saved for resuming, checked by playing the last episodes again."""
+
+import copy
+import hashlib
+import itertools
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+
+from mace_rl.environments.environment import Environment
+from mace_rl.environments.episode import Episode
+from mace_rl.training.rollout import roll_out
+
+EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
+# Environments of these modules remember nothing from one episode to the next but their generator,
+# nor do Gymnasium's plain wrappers around them.
+FORGETFUL = ("gymnasium.envs.classic_control.", "gymnasium.envs.toy_text.", "mace_rl.environments.")
+PLAIN_WRAPPERS = "gymnasium.wrappers.common"
+OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermost of its wrappers
+
+
+def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
+    """What the next episode depends on, as far as it can be known.
+
+    The environment's generator, its own `state_dict()` if any, and, which takes longer, the global
+    generators if `of_process`.
+    """
+    env: Any = environment.env
+    offers = all(map(env.has_wrapper_attr, OFFERED))
+    state = {
+        "np_random": _plain(environment.generator.bit_generator.state),
+        "own": copy.deepcopy(env.get_wrapper_attr("state_dict")()) if offers else None,
+    }
+    return state | global_state() if of_process else state
+
+
+def set_state(environment: Environment, state: dict[str, Any]) -> None:
+    """Restore what `state_of` returned."""
+    env: Any = environment.env
+    if state["own"] is not None:
+        env.get_wrapper_attr("load_state_dict")(copy.deepcopy(state["own"]))
+    environment.generator.bit_generator.state = state["np_random"]
+    if "random" in state:
+        set_global_state(state)
+
+
+def global_state() -> dict[str, Any]:
+    """That of Python's, NumPy's and PyTorch's global generators."""
+    return {
+        "random": random.getstate(),
+        "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002
+        "torch": torch.get_rng_state(),
+    }
+
+
+def set_global_state(state: dict[str, Any]) -> None:
+    """Restore what `global_state` returned."""
+    random.setstate(state["random"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(state["torch"])
+
+
+@contextmanager
+def seeded(seed: np.random.SeedSequence) -> Iterator[None]:
+    """Code that draws from the global generators repeats itself; afterwards they are as before."""
+    before = global_state()
+    first, *others = seed.generate_state(6).tolist()
+    random.seed(first)
+    np.random.seed(others[:4])  # noqa: NPY002
+    torch.manual_seed(others[4])
+    try:
+        yield
+    finally:
+        set_global_state(before)
+
+
+def is_forgetful(environment: Environment) -> bool:
+    """Whether the generator is known to be all that its next episode depends on."""
+    env: Any = environment.env
+    while env is not env.unwrapped:
+        if type(env).__module__ != PLAIN_WRAPPERS:
+            return False
+        env = env.env
+    return type(env).__module__.startswith(FORGETFUL)
+
+
+class LastEpisodes:
+    """The last episodes, and the state before each; of those in a checkpoint actions and a digest.
+
+    They are in two blocks. The global generators are saved before the first episode of a block.
+    Nothing is kept of an environment that `is_forgetful`.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        self.blocks: list[list[dict[str, Any]]] = [[]]
+        self.kept = not is_forgetful(environment)
+
+    def begin(self, environment: Environment) -> None:
+        """Before an episode."""
+        if not self.kept:
+            return
+        block = self.blocks[-1]
+        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+            self.blocks = [block, []]
+        self.blocks[-1].append({"start": state_of(environment, of_process=not self.blocks[-1])})
+
+    def end(self, episode: Episode) -> None:
+        """After an episode."""
+        if self.kept:
+            self.blocks[-1][-1] |= {"actions": episode.actions, "outcome": episode}
+
+    def saved(self) -> list[list[dict[str, Any]]]:
+        """For a checkpoint."""
+        for one in itertools.chain.from_iterable(self.blocks):
+            if isinstance(episode := one["outcome"], Episode):
+                actions = torch.from_numpy(episode.actions)
+                one |= {"actions": actions, "outcome": _digest(episode)}
+        return self.blocks
+
+
+def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
+    """What is different if a new environment plays `LastEpisodes.blocks` again; "" if nothing."""
+    for one in itertools.chain.from_iterable(blocks):
+        set_state(environment, one["start"])
+        try:
+            episode = roll_out(environment, _Again(), one["actions"].numpy())
+        except Exception as error:  # noqa: BLE001  (whatever it raises, in a state it never had)
+            return " ".join(f"{type(error).__name__}: {error}".split())
+        if _digest(episode) != one["outcome"]:
+            return "other observations or rewards"
+    return ""
+
+
+class _Again:  # an `ActingPolicy` whose noise are the actions to take
+    def act(self, observation: np.ndarray, noise: Any) -> tuple[Any, np.float32]:
+        return (noise if isinstance(noise, np.ndarray) else int(noise)), np.float32(0)
+
+
+def _digest(episode: Episode) -> str:
+    parts = (episode.observations, episode.rewards, np.array(float(episode.terminated)))
+    # + 0: compiled code may have -0.0 where the environment has 0.0, which is no difference.
+    return hashlib.sha256(b"".join((part + 0).tobytes() for part in parts)).hexdigest()
+
+
+def _plain(state: Any) -> Any:  # a NumPy generator's state with lists for its arrays
+    if isinstance(state, dict):
+        return {key: _plain(value) for key, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray) else state

@@ -1,0 +1,1 @@
+"""The bonus for agents of others, as Gymnasium wrappers."""

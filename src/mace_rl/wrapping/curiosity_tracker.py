@@ -1,0 +1,188 @@
+"""Curiosity while an episode is played: what the wrappers ask of it, step by step."""
+
+import copy
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete
+
+from mace_rl.agent.advantages import paid_returns
+from mace_rl.agent.ppo import TINY
+from mace_rl.agent.scale import RewardScale
+from mace_rl.base.rng import Streams
+from mace_rl.base.state import Stateful
+from mace_rl.beta.controller import BetaController
+from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.config.beta import LARGEST_BETA, CustomBeta
+from mace_rl.config.section import ConfigError, short_repr
+from mace_rl.config.wrappers import CuriosityConfig
+from mace_rl.environments.episode import Episode
+from mace_rl.environments.spaces import Spaces
+from mace_rl.numerics.arrays import total
+from mace_rl.numerics.finite import require_within
+from mace_rl.training.factories import beta_rule
+
+# What a step's `info` gets, float.
+PARTS = ("reward_extrinsic", "reward_curiosity", "curiosity", "novelty", "relevance", "beta")
+
+
+@dataclass
+class Recording:
+    """An unfinished episode."""
+
+    beta: float
+    unit: float  # see `CuriosityTracker.unit`
+    usual: float  # R_curiosity that is paid with 0
+    visits: np.ndarray  # to each Discrete state so far, [observation]; 0 for Box ones
+    observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
+    actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
+    rewards: list[float] = field(default_factory=list)  # extrinsic
+    bonus: list[float] = field(default_factory=list)  # R_curiosity
+
+    def episode(self, terminated: bool) -> Episode:
+        """The finished episode; the log-probabilities of its actions are unknown, NaN."""
+        unknown = np.full(len(self.rewards), np.nan, np.float32)
+        states, actions = np.stack(self.observations), np.array(self.actions)
+        return Episode(states, actions, unknown, np.array(self.rewards), terminated)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Each part as one tensor."""
+        return {name: torch.from_numpy(np.array(part)) for name, part in vars(self).items()}
+
+    @classmethod
+    def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
+        """From the tensors of `state_dict` as arrays."""
+        beta, unit, usual, visits, *lists = state.values()
+        return cls(beta.item(), unit.item(), usual.item(), visits, *map(list, lists))
+
+
+class CuriosityTracker(Stateful):
+    """The curiosity bonus for unfinished episodes of several environments."""
+
+    STATE = ("curiosity", "controller", "scales", "paid", "count", "recordings", "steps")
+
+    def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
+        self.config, self.spaces = config, spaces
+        streams = Streams(config.seed)
+        space, size = spaces.observation_space, spaces.observation_size
+        memory = config.memory if config.relevance else None
+        self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
+        self.controller = beta_rule(config.beta, streams["beta"])
+        if isinstance(config.beta, CustomBeta):
+            require_usable(config.beta.rule, self.controller, environments)
+        smallest = {"extrinsic": 1.0, "curiosity": TINY}
+        self.scales = {kind: RewardScale(config.discount, x) for kind, x in smallest.items()}
+        self.paid, self.count = 0.0, 0  # R_curiosity of all ended episodes, and their steps
+        self.recordings: list[Recording | None] = [None] * environments
+        self.steps = 0  # of whole episodes since the agent's last update
+
+    @property
+    def unit(self) -> float:
+        """The extrinsic reward that 1 of R_curiosity is worth; 0 before any episode has ended."""
+        extrinsic, curiosity = self.scales.values()
+        return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
+
+    def begin(self, environment: int, observation: Any, afresh: bool = False) -> None:
+        """Start an episode; one that is not over ends here, or, if all is afresh, is forgotten."""
+        unfinished = self.recordings[environment]
+        if unfinished is not None and unfinished.rewards and not afresh:
+            self.end(environment, terminated=False)
+        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
+        require_within("β", beta, largest=LARGEST_BETA)
+        usual = self.paid / self.count if self.config.centred and self.count else 0.0
+        visits = np.zeros(len(first))
+        self.recordings[environment] = Recording(beta, self.unit, usual, visits, [first])
+
+    def taken(self, action: Any) -> Any:
+        """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
+        space = self.spaces.action_space
+        if isinstance(space, Discrete):
+            return int(action) - int(space.start)
+        return np.array(action, np.float32)
+
+    def reward_parts(
+        self, environment: int, action: Any, reward: Any, observation: Any
+    ) -> dict[str, float]:
+        """`PARTS` of the reward for a step, from its extrinsic reward and next observation.
+
+        action: from `taken`, before the step, since an environment may write into the one it gets.
+        """
+        recording = self.recordings[environment]
+        if recording is None:
+            raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
+        step = len(recording.rewards) + 1
+        reward = self.spaces.paid(reward, step)
+        state = np.array(self.spaces.encode(observation, step))  # a copy
+        found = self.curiosity.appraise(state[None], recording.visits)
+        bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
+        if not 0 <= bonus <= 1:
+            require_within("the curiosity bonus", bonus, rounding=1e-6)
+            bonus = max(bonus, 0.0)
+        if self.spaces.discrete_observations:
+            recording.visits += state
+        recording.actions.append(action)
+        recording.observations.append(state)
+        recording.rewards.append(reward)
+        recording.bonus.append(bonus)
+        paid = recording.beta * recording.unit * (bonus - recording.usual)
+        values = (reward, paid, bonus, novelty, relevance, recording.beta)
+        return dict(zip(PARTS, values, strict=True))
+
+    def end(self, environment: int, terminated: bool) -> None:
+        """Finish an episode: it becomes memory, and β is set for the next."""
+        recording = self.recordings[environment]
+        assert recording is not None
+        self.recordings[environment] = None
+        episode, bonus = recording.episode(terminated), np.array(recording.bonus)
+        self.scales["extrinsic"].update(episode.rewards)
+        self.scales["curiosity"].update(bonus)
+        self.paid, self.count = self.paid + total(bonus), self.count + len(episode)
+        self.curiosity.remember(episode, paid_returns(episode.rewards, self.config.discount))
+        self.controller.next_episode(episode, bonus)
+        self.steps += len(episode)
+        if self.steps >= self.config.rollout_steps:
+            self.controller.end_rollout()
+            self.steps = 0
+
+    def described(self) -> dict[str, Any]:
+        """The settings that have to be the same where a state is loaded."""
+        return {
+            **self.config.model_dump(exclude={"seed"}),  # the generators are in the state
+            "observation_size": self.spaces.observation_size,
+            "observation_space": type(self.spaces.observation_space).__name__,
+            "environments": len(self.recordings),
+            "form": 7,  # of the state itself
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """As `CuriosityReward.state_dict` says."""
+        return super().state_dict() | {"settings": self.described()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As `CuriosityReward.load_state_dict` says."""
+        theirs, mine = state["settings"], self.described()
+        for name in sorted(theirs.keys() | mine.keys()):
+            if name not in theirs or name not in mine or theirs[name] != mine[name]:
+                states = (theirs, mine)
+                then, now = (short_repr(x[name]) if name in x else "unknown" for x in states)
+                raise ConfigError(
+                    f"the state to load was made with {name} {then}, but here it is {now}"
+                )
+        super().load_state_dict(copy.deepcopy(state))
+        found: list[Any] = self.recordings
+        self.recordings = [None if one is None else Recording.from_state(one) for one in found]
+
+
+def require_usable(rule: str, controller: BetaController, environments: int) -> None:
+    """Raise `ConfigError` for a user's own rule that needs what a wrapper lacks."""
+    why = ""
+    if controller.learns:
+        why = "from policy gradients, but only our trainer has these"
+    elif controller.one_at_a_time and environments > 1:
+        why = f"from each episode before the next begins, but here {environments} go on at once: "
+        why += "wrap each environment in a CuriosityReward"
+    if why:
+        raise ConfigError(f"beta.rule has {rule!r}, which learns {why}")

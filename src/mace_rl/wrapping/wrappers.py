@@ -1,0 +1,180 @@
+"""The curiosity bonus for any agent: wrappers that add β · R_curiosity to an environment's reward.
+
+    env = CuriosityReward(gymnasium.make("FrozenLake-v1"))  # and everything else as without
+
+    reward = R_extrinsic + β · u · (R_curiosity - m),      u = s_E / s_I
+
+R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages in units of their
+scale; a wrapper sees rewards only, and leaves the extrinsic one as it is. So u brings the bonus to
+its unit: s_E and s_I are the standard deviations of the discounted sums of either reward in all
+episodes so far (`RewardScale`), s_E at least 1. With β = 0.4 the sums of the bonus vary 0.4 times
+as much as those of the extrinsic reward, or 0.4 if these vary by less than 1.
+
+m is the mean of R_curiosity in all episodes so far. Without it every step would pay, and an agent
+with one critic would rather not end an episode: docs/wrappers.md has what was measured. The trainer
+has a critic for each reward. `centred=False` leaves m out, as in the paper.
+
+β, u and m are constant during an episode. At its end the episode becomes memory, novelty is
+updated, and all three are set for the next. In the first episode u is 0: no bonus is paid yet. An
+episode that is reset before it ends, as by a time limit around this wrapper, ends there; where
+`reset` gets a seed, so that all begins afresh, it is forgotten.
+"""
+
+from collections.abc import Mapping
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from mace_rl.config.section import ConfigError, check
+from mace_rl.config.wrappers import CuriosityConfig
+from mace_rl.environments.spaces import Spaces
+from mace_rl.wrapping.curiosity_tracker import PARTS, CuriosityTracker
+
+Settings = Mapping[str, Any]
+
+
+class CuriosityMixin(RecordConstructorArgs):
+    """What both wrappers have; `CuriosityReward` says what the arguments mean."""
+
+    def __init__(
+        self,
+        env: Any,
+        beta: float | Settings = 0.4,
+        *,
+        relevance: bool = True,
+        centred: bool = True,
+        memory: Settings | None = None,
+        novelty: Settings | None = None,
+        discount: float = 0.99,
+        rollout_steps: int = 1,
+        seed: int = 0,
+    ) -> None:
+        settings = given(locals())
+        RecordConstructorArgs.__init__(self, **settings)  # for `spec`, from which it can be remade
+        super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]  # Gymnasium's
+        config = check(CuriosityConfig, settings, type(self).__name__)
+        count, spaces = 1, (env.observation_space, env.action_space)
+        if isinstance(env, VectorEnv):
+            count, spaces = env.num_envs, (env.single_observation_space, env.single_action_space)
+            self.mode = env.metadata.get("autoreset_mode")
+            if not isinstance(self.mode, AutoresetMode):
+                raise ConfigError(
+                    f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
+                    " but it should be one of gymnasium.vector.AutoresetMode"
+                )
+        self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the bonus depends on, the unfinished episode included.
+
+        Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
+        `weights_only`. The states of the environment and the agent are not in it.
+        """
+        return self.tracker.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned; `ConfigError` if other settings made it."""
+        self.tracker.load_state_dict(state)
+
+
+class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
+
+    env: observations are of any space that has a flat form, and the agent gets them unchanged;
+        actions are Discrete or one-dimensional Box. Episodes have to end, by a time limit or a
+        reset: nothing is learned from one that does not.
+    beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
+        "exponential", …} or "custom". Not "meta" or "pretrained", which ask for policy gradients.
+    centred: False to pay R_curiosity itself, not what it is beyond its mean.
+    relevance: False for novelty alone, without memory; `memory` is then refused.
+    memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
+    discount: γ of the agent (gamma in stable-baselines3), per step.
+    rollout_steps: steps between the agent's updates (n_steps there), for rules that ask.
+    seed: of the bonus's random numbers; `reset(seed=…)` is the environment's.
+
+    `info` of a step gets `PARTS`, each a float: `reward_extrinsic` and `reward_curiosity`, whose
+    sum is the reward, in the environment's unit; R_curiosity in [0, 1], as `curiosity`, with its
+    factors `novelty` and `relevance`; and `beta`.
+
+    Memory holds the discounted return-to-go of each state to the end of its episode. There is no
+    critic as in the trainer: nothing is added beyond a time limit.
+
+    Raises `ConfigError`, one line, for settings and spaces that do not work and observations of
+    another size, and `NonFiniteError` for rewards, observations or bonuses that are not numbers.
+    """
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.tracker.begin(0, observation, afresh=seed is not None)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """The environment's step, with another reward and more in `info`."""
+        taken = self.tracker.taken(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        parts = self.tracker.reward_parts(0, taken, reward, observation)
+        if terminated or truncated:
+            self.tracker.end(0, bool(terminated))
+        total = parts["reward_extrinsic"] + parts["reward_curiosity"]
+        return observation, total, terminated, truncated, {**(info or {}), **parts}
+
+
+# Gymnasium's class takes no types as arguments before its version 1.3.
+class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
+    """`CuriosityReward` for environments that are stepped together and share memory and novelty.
+
+    An episode in one of them is known in all as soon as it has ended. Arguments are those of
+    `CuriosityReward`. Its entries of `info` are arrays, float64 [environments], with Gymnasium's
+    masks: an environment that was only reset gets no bonus. All modes of autoreset work. The
+    entries for the last step of an episode are in `infos`, not in `final_info`.
+    """
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """The environments' reset; of those in `options["reset_mask"]` if that is there."""
+        chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
+        observations, infos = self.env.reset(seed=seed, options=options)
+        for i in np.flatnonzero(chosen).tolist():
+            self.tracker.begin(i, observations[i], afresh=seed is not None)
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """The environments' step, with other rewards, float64, and more in `infos`."""
+        taken = [self.tracker.taken(action) for action in actions]
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        ended = terminated | truncated
+        reached = observations
+        if self.mode is AutoresetMode.SAME_STEP and ended.any():
+            final = infos["final_obs"]
+            reached = [final[i] if ended[i] else observations[i] for i in range(self.num_envs)]
+        over = np.array([recording is None for recording in self.tracker.recordings])
+        fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
+        values = np.zeros((len(PARTS), self.num_envs))
+        for i in np.flatnonzero(~fresh).tolist():
+            parts = self.tracker.reward_parts(i, taken[i], rewards[i], reached[i])
+            values[:, i] = list(parts.values())
+        for i in np.flatnonzero(ended).tolist():
+            self.tracker.end(i, bool(terminated[i]))
+        for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
+            self.tracker.begin(i, observations[i])
+        total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
+        told = dict(zip(PARTS, values, strict=True))
+        masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)
+        return observations, total, terminated, truncated, {**infos, **told, **masks}
+
+
+def given(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The settings among a constructor's arguments, without memory or novelty if None."""
+    omitted = [name for name in ("memory", "novelty") if arguments[name] is None]
+    return {name: arguments[name] for name in CuriosityConfig.model_fields if name not in omitted}
+
+
+def name_of(env: Any) -> str:
+    """What an environment is called in messages."""
+    return str(env) if env.spec is None else env.spec.id

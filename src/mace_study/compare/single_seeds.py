@@ -1,0 +1,141 @@
+"""The paper's Table 1 as a draw: could it be one seed of each variant in this study?
+
+Both metrics are read by the public code's rules (docs/worlds-protocol.md, "The table as a draw").
+Whatever is asked is exact: over all seeds that could have been drawn.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from mace_study.compare.claims_config import Table1Config
+
+CENTRAL = 0.9  # a number that is not within so much of the seeds is unusual
+LEVEL = 0.05  # a study in which fewer draws have as many unusual numbers is unlike the paper's
+
+
+class Draw(NamedTuple):
+    """What one seed of each variant would give; chances are of draws of this study."""
+
+    unusual: int  # of the paper's numbers
+    numbers: int  # how many it has
+    chance_unusual: float  # that a draw has as many, among the study's other seeds
+    limit: int  # so many are seen in fewer than `LEVEL` of the draws
+    favoured: str  # the variant that is first in most columns of the paper's table
+    first: int  # in so many columns of the environments that the study has
+    chance_first: float  # that it is first in as many
+    chance_any: float  # the same of a variant chosen at random, in each environment by itself
+
+
+def numbers(runs: pd.DataFrame, table1: Table1Config) -> pd.DataFrame:
+    """Where each of the paper's numbers stands among the seeds.
+
+    runs: the frame of metrics.csv. Columns: env, variant, metric (as it is read), paper, seeds,
+    low, median, high (low to high: the central `CENTRAL` of the seeds), place (`places`) and
+    unusual (0 or 1). Environments that `runs` lacks are left out.
+    """
+    names = ["env", "variant", "metric", "paper", "seeds", "low", "median", "high", "place"]
+    rows = []
+    for (env, variant), own in _cells(runs, table1).items():
+        paper = np.array(table1.values[env][variant], np.float64)
+        ends = (1 - CENTRAL) / 2, 0.5, (1 + CENTRAL) / 2
+        found = *np.quantile(own, ends, axis=0), places(paper, own)
+        for column, metric in enumerate(table1.public_code):
+            one = (values[column] for values in found)
+            rows.append((env, variant, metric, paper[column], len(own), *one))
+    table = pd.DataFrame(rows, columns=names)
+    return table.assign(unusual=_unusual(table["place"].to_numpy()).astype(int))
+
+
+def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
+    """What one seed of each variant gives, and how the paper's table compares; as in `numbers`."""
+    cells = _cells(runs, table1)
+    environments = list(dict.fromkeys(env for env, _ in cells))
+    found = int(numbers(runs, table1)["unusual"].sum())
+    unusual = at_least(_unusual_when_drawn(own) for own in cells.values())
+    paper = {env: first_in(_paper(env, table1)) for env in table1.values}
+    led = {name: sum(one[name].item() for one in paper.values()) for name in table1.variants}
+    favoured = max(led, key=led.__getitem__)
+    first = sum(int(paper[env][favoured].item()) for env in environments)
+    firsts = []
+    for env in environments:
+        wins = first_in({name: cells[env, name] for name in table1.variants})
+        firsts.append(
+            {name: _shares(counts, len(table1.public_code)) for name, counts in wins.items()}
+        )
+    own = at_least(shares[favoured] for shares in firsts)
+    anyone = at_least(np.mean(list(shares.values()), axis=0) for shares in firsts)
+    return Draw(
+        unusual=found,
+        numbers=len(cells) * len(table1.public_code),
+        chance_unusual=float(unusual[found]),
+        limit=int(np.argmax(np.append(unusual, 0.0) < LEVEL)),
+        favoured=favoured,
+        first=first,
+        chance_first=float(own[first]),
+        chance_any=float(anyone[first]),
+    )
+
+
+def places(values: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The place of each value among `seeds`, [n, ...], from 0 to 1: its mid-rank over n + 1."""
+    less, equal = (seeds < values).sum(axis=0), (seeds == values).sum(axis=0)
+    return (less + (equal + 1) / 2) / (len(seeds) + 1)
+
+
+def first_in(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """In how many columns each variant alone is lowest, of every draw of a row each.
+
+    cells: by variant its rows, [seeds, columns]. Returns by variant int64 [seeds of the first,
+    seeds of the second, ...].
+    """
+    count = len(cells)
+    spread = {
+        name: np.expand_dims(rows, [axis for axis in range(count) if axis != place])
+        for place, (name, rows) in enumerate(cells.items())
+    }
+    won = {}
+    for name, rows in spread.items():
+        others = [other for key, other in spread.items() if key != name]
+        won[name] = np.sum(rows < reduce(np.minimum, others), axis=-1)
+    return won
+
+
+def at_least(shares: Iterable[np.ndarray]) -> np.ndarray:
+    """The chance that a sum of independent counts is at least 0, 1, ...; shares: of 0, 1, ..."""
+    return np.minimum(np.cumsum(reduce(np.convolve, shares)[::-1])[::-1], 1.0)
+
+
+def _cells(runs: pd.DataFrame, table1: Table1Config) -> dict[tuple[str, str], np.ndarray]:
+    """By environment and variant the two metrics of every seed, float64 [seeds, 2]."""
+    return {
+        (env, variant): runs.loc[
+            (runs["env"] == env) & (runs["variant"] == variant), table1.public_code
+        ].to_numpy(np.float64)
+        for env in table1.values
+        for variant in table1.variants
+        if env in set(runs["env"])
+    }
+
+
+def _paper(env: str, table1: Table1Config) -> dict[str, np.ndarray]:
+    return {name: np.array([table1.values[env][name]], np.float64) for name in table1.variants}
+
+
+def _unusual(place: np.ndarray) -> np.ndarray:
+    return np.abs(place - 0.5) >= CENTRAL / 2 - 1e-9
+
+
+def _unusual_when_drawn(own: np.ndarray) -> np.ndarray:
+    """How often 0, 1, ... columns of a seed are unusual among the others, [columns + 1]."""
+    others = (np.delete(own, seed, axis=0) for seed in range(len(own)))
+    place = np.array([places(row, rest) for row, rest in zip(own, others, strict=True)])
+    return _shares(_unusual(place).sum(axis=1), own.shape[1])
+
+
+def _shares(counts: np.ndarray, most: int) -> np.ndarray:
+    """Which share of `counts` is 0, 1, ..., `most`."""
+    return np.bincount(counts.ravel(), minlength=most + 1) / counts.size

@@ -1,0 +1,149 @@
+"""The study: which runs there are, with which hyperparameters, and how they are evaluated.
+
+Planning the workflow imports this module, so it stays clear of torch and numba.
+"""
+
+import itertools
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from colorsys import hsv_to_rgb
+from functools import reduce
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from mace_rl.config.plugins import load
+from mace_rl.config.reading import Settings, merge, read_yaml
+from mace_rl.config.section import ConfigError, check, check_known
+from mace_rl.environments import registered
+from mace_rl.run_settings import RunSettings, Variant, check_name
+from mace_study.config.labels import require_latex
+from mace_study.config.metrics import GOALS, FigureConfig, MetricsConfig, Names, once
+
+# What the figures' font has; Matplotlib leaves out of legends what begins with '_'.
+LETTERS, SIGNS = r" -\u02af\u0370-\u037e\u0384-\u045f\u0490\u0491", r"\u2010-\u20b5\u2190-\u22ff"
+LABEL = rf"(?![_ ])[{LETTERS}{SIGNS}]{{1,60}}(?<! )"
+
+
+def _label(text: str) -> str:
+    if not (text.isprintable() and re.fullmatch(LABEL, text)):
+        raise ValueError(
+            "it should be 1 to 60 Latin, Greek or Cyrillic letters, digits and signs on one line,"
+            " without '_' before and spaces around them"
+        )
+    return text
+
+
+def _folder(path: str) -> str:
+    if not path.strip() or re.search(r"[{}\n\r\0*?\[\]]", path):
+        raise ValueError("it should be the path of a folder, without {}*?[]")
+    if max(map(len, path.encode().split(b"/"))) > 255:
+        raise ValueError("its names should be of at most 255 bytes")
+    for part in (Path(path), *Path(path).parents):
+        if not part.is_dir() and (part.exists() or part.is_symlink()):
+            found = "file" if part.exists() else "link that leads nowhere"
+            raise ValueError(f"it should be a folder, and {part} is a {found}")
+    return path
+
+
+class ShownVariant(Variant):
+    """A variant with a label that tables and figures can set."""
+
+    label: Annotated[str, AfterValidator(_label)] | None = None
+
+
+Seeds = Annotated[
+    list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(once)
+]
+
+
+class Study(RunSettings):
+    """All runs of a study, each environment × variant × seed, and how they are evaluated."""
+
+    results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
+    environments: Names
+    variants: Names
+    seeds: Seeds
+    # Other seeds for some environments, where one run takes long.
+    environment_seeds: dict[str, Seeds] = Field(default={})
+    variant_settings: Mapping[str, ShownVariant]
+    metrics: MetricsConfig
+    figure: FigureConfig
+    claims: str  # the file of what the paper says: claims_config.py
+
+    def runs(self) -> list[tuple[str, str, int]]:
+        """Environment, variant and seed of every run, in the configured order."""
+        return [
+            (environment, variant, seed)
+            for environment in self.environments
+            for variant in self.variants
+            for seed in self.environment_seeds.get(environment, self.seeds)
+        ]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The names of the study's variants in tables and figures."""
+        return {name: self.variant_settings[name].label or name for name in self.variants}
+
+    @property
+    def colours(self) -> dict[str, str]:
+        """The colours of the study's variants: their own, Matplotlib's ten, then hues far apart."""
+        from matplotlib.colors import TABLEAU_COLORS, to_hex
+
+        hues = (hsv_to_rgb(0.618 * n % 1, 1, (0.4, 0.7, 1)[n % 3]) for n in itertools.count())
+        given = {name: variant.colour for name, variant in self.variant_settings.items()}
+        taken = set(map(to_hex, filter(None, given.values())))
+        every = itertools.chain(TABLEAU_COLORS, map(to_hex, hues))
+        free = (colour for colour in every if to_hex(colour) not in taken)
+        colours = {name: colour or next(free) for name, colour in given.items()}
+        return {name: colours[name] for name in self.variants}
+
+
+def load_study(config: Mapping[Any, Any], origin: str) -> Study:
+    """Check a configuration, every run's settings included; `origin` begins a `ConfigError`."""
+    from matplotlib.colors import is_color_like
+
+    study = check(Study, {str(key): value for key, value in config.items()}, origin)
+    try:
+        for variant in study.variants:
+            check_known(variant, study.variant_settings, "variants", "variant_settings")
+        for variant, shown in study.variant_settings.items():
+            check_name(variant, "variant_settings")
+            require_latex(shown.label or "", f"variant_settings.{variant}.label")
+            if shown.colour is not None and not is_color_like(shown.colour):
+                raise ConfigError(
+                    f"variant_settings.{variant}.colour is {shown.colour!r}, but should be a colour"
+                    " of Matplotlib's, such as tab:blue or '#1f77b4'"
+                )
+        [(label, count)] = Counter(study.labels.values()).most_common(1)
+        if count > 1:
+            raise ConfigError(f"{count} variants have the label {label!r}; each needs its own")
+        for variant in itertools.chain.from_iterable(study.metrics.comparisons):
+            check_known(variant, study.variant_settings, "metrics.comparisons", "variant_settings")
+        known = dict.fromkeys([*study.environments, *study.environment_settings])
+        for environment, variant in itertools.product(known, study.variant_settings):
+            study.run_config(environment, variant, 0)  # checks its settings
+        for environment in study.environment_seeds:
+            check_known(environment, known, "environment_seeds", "environments")
+        for environment in study.environments:
+            study.metrics.random_return_in(environment)  # there has to be one
+        for key in ("random_return", *GOALS):
+            for environment in getattr(study.metrics, key):
+                if environment not in known and ":" not in environment:
+                    check_known(environment, registered(), f"metrics.{key}", "Gymnasium's registry")
+        for reference in study.metrics.custom:
+            load(reference, "metrics.custom")
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from None
+    return study
+
+
+def read_study(paths: Sequence[Path]) -> Study:
+    """The study of one YAML file and others read over it: mappings merge, lists are replaced.
+
+    Raises `ConfigError` as `read_yaml` and `load_study` do.
+    """
+    config: Settings = reduce(merge, map(read_yaml, paths), {})
+    return load_study(config, " + ".join(map(str, paths)))

@@ -1,0 +1,89 @@
+"""betas.csv: where β ends, its range, and whether it is larger where learning stagnates."""
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy  # loads what is used of it when it is
+
+from mace_rl.training.records import RunKey
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure import metrics
+
+if TYPE_CHECKING:  # planning the workflow imports this module
+    import pandas as pd
+
+# Columns beside β's own: in all of training, before and after the common bar.
+CORRELATION = "stagnation_correlation"
+BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
+CORRELATIONS = CORRELATION, BEFORE, AFTER
+LABELS = {  # of columns, in tables
+    "beta_end": "β at the end",
+    "beta_lowest": "lowest β",
+    CORRELATION: "with stagnation",
+    BEFORE: "before the common bar",
+    AFTER: "after it",
+}
+
+
+def betas_columns(settings: MetricsConfig) -> dict[str, type]:
+    """The columns of betas.csv; without a common bar nothing is before or after it."""
+    correlations = CORRELATIONS if settings.reference_return else [CORRELATION]
+    values = dict.fromkeys(["beta_end", "beta_lowest", "beta_highest", *correlations], float)
+    return {"env": str, "variant": str, "seed": int} | values
+
+
+def betas_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) -> "pd.DataFrame":
+    """The data of betas.csv: of each run β at its end, its range, its stagnation correlations."""
+    import pandas as pd
+
+    rows = []
+    for run, frame in runs.items():
+        beta, curve = frame["beta"].to_numpy(), metrics.learning_curve(frame, run[0], settings)
+        end = metrics.final_return(beta, settings.final_fraction)
+        found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
+        found += stagnation_correlations(curve, beta) if settings.reference_return else []
+        rows.append([*run, end, beta.min(), beta.max(), *found])
+    return pd.DataFrame(rows, columns=list(betas_columns(settings)))
+
+
+def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
+    """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
+
+    returns, betas: [E]. Stagnation is minus the `slope`.
+    """
+    return _correlation(-metrics.slope(returns, window), betas)
+
+
+def stagnation_correlations(curve: metrics.LearningCurve, betas: np.ndarray) -> tuple[float, float]:
+    """The same, by the `growing_slope`, before and after `sample_efficiency_common`.
+
+    betas: [E]. An episode's stagnation and the next one's β are before that episode if both are.
+    0, too, for a time of which there are fewer than two.
+    """
+    reached = metrics.sample_efficiency_common(curve)
+    stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
+    until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
+    before = _correlation(stagnation[:until], betas[: reached.number])
+    after = _correlation(stagnation[max(0, until - 1) :], betas)
+    return before, 0.0 if reached.censored else after
+
+
+def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
+    """`slope` from episode 2 · ceil(window / 10) on: single episodes side by side are noise.
+
+    While there are no 2 windows, the halves of the episodes so far are compared.
+    """
+    first = 2 * math.ceil(window / 10)
+    ends = range(first, min(2 * window, len(returns) + 1))
+    growing = [metrics.slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
+    return np.concatenate([*growing, metrics.slope(returns, window)])
+
+
+def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
+    """Of each entry but the last with the β after it; both end with the same episode."""
+    following = betas[len(betas) - len(stagnation) + 1 :]
+    if len(following) < 2 or np.ptp(stagnation[:-1]) == 0 or np.ptp(following) == 0:
+        return 0.0
+    return float(scipy.stats.spearmanr(stagnation[:-1], following).statistic)

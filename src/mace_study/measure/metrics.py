@@ -1,0 +1,386 @@
+"""What is measured on one run, and metrics.csv: how well it ends, and how soon (docs/metrics.md).
+
+A metric is a pure function of a `LearningCurve`. A run that never attains a metric in episodes
+counts with E, its number of episodes, and is flagged as censored: E is then a lower bound.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from itertools import zip_longest
+from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from mace_rl.config.plugins import load
+from mace_rl.config.section import ConfigError
+from mace_rl.training.records import RecordError, RunKey, read_table
+from mace_study.config.metrics import MetricsConfig
+
+if TYPE_CHECKING:  # planning the workflow imports this module, without pandas
+    import pandas as pd
+
+PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
+PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
+PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
+PUBLIC_CODE_LAST = 10  # [R] episodes whose mean sets the bar of sample efficiency
+
+COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
+
+
+class Attained(NamedTuple):
+    """The episode (from 1) at which something is attained; E and censored if it never is."""
+
+    number: int
+    censored: bool
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """What a metric sees of one run."""
+
+    returns: np.ndarray  # float64 [E], the extrinsic return of each training episode
+    final: float  # `final_return` of these
+    random_mean: float  # mean return of uniformly random actions in this environment
+    settings: MetricsConfig
+    reference: float = math.nan  # `reference_return` and `solved_return` in this environment,
+    solved: float = math.nan  # where the study has them
+
+    @cached_property
+    def learned(self) -> bool:
+        """Whether the run ends better than random actions, by more than two standard errors.
+
+        If not, a bar that depends on how it ends says nothing: 75 % of 0 is reached in episode 1.
+        """
+        last = last_part(self.returns, self.settings.final_fraction)
+        return bool(self.final - 2 * last.std() / math.sqrt(len(last)) > self.random_mean)
+
+    @cached_property
+    def average(self) -> np.ndarray:
+        """The `moving_average`, [E - window + 1]."""
+        return moving_average(self.returns, self.settings.moving_average)
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Its `slope`, [E - 2 · window + 1]."""
+        return slope(self.returns, self.settings.moving_average)
+
+    def bar(self, goal: float) -> float:
+        """The return threshold of the way from random actions to `goal`."""
+        return self.random_mean + self.settings.threshold * (goal - self.random_mean)
+
+    def first(self, reached: np.ndarray, episode: int = 1) -> Attained:
+        """The first true entry of `reached` [n], whose entry 0 belongs to episode `episode`."""
+        if not reached.any():
+            return Attained(len(self.returns), True)
+        return Attained(episode + int(np.argmax(reached)), False)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One thing measured on each run."""
+
+    name: str  # of its column in metrics.csv
+    label: str  # in tables
+    unit: Literal["episodes", "return", "share"]  # of episodes fewer are better, else more is
+    function: Callable[[LearningCurve], Attained | float]  # an Attained if the unit is episodes
+    needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
+    # In comparisons.csv, where each metric makes the correction stricter.
+    compared: bool = field(default=True, kw_only=True)
+    # Of the moving average's window and E, the first episode that it can be.
+    earliest: Callable[[int, int], int] = field(default=lambda window, _: 1, kw_only=True)
+
+    @property
+    def flag(self) -> str:
+        """The column that tells which episodes are censored."""
+        return f"{self.name}_censored"
+
+
+def last_part(returns: np.ndarray, fraction: float) -> np.ndarray:
+    """The last `fraction` of the episodes, rounded up (paper: the last 10 %)."""
+    last = math.ceil(Fraction(repr(fraction)) * len(returns))  # 0.07 of 100 is 7, not 7.000…001
+    return returns[-last:]
+
+
+def final_return(returns: np.ndarray, fraction: float) -> float:
+    """Mean return of `last_part`."""
+    return float(np.mean(last_part(returns, fraction)))
+
+
+def moving_average(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of each `window` consecutive values, [E - window + 1]; empty if E < window."""
+    return _moving_sum(values, window) / window
+
+
+def slope(returns: np.ndarray, window: int) -> np.ndarray:
+    """Slope of the moving average in return per episode, [E - 2 · window + 1] or empty.
+
+    Entry i belongs to episode 2 · `window` + i and compares the last `window` episodes with the
+    `window` before them. (From one episode to the next the average's change is noise.)
+    """
+    total = _moving_sum(returns, window)
+    return (total[window:] - total[:-window]) / window**2
+
+
+def sample_efficiency(curve: LearningCurve) -> Attained:
+    """The first episode with a return ≥ threshold · final (paper, literally).
+
+    Negative returns: the bar is above the final return. Censored: never reached, or not `learned`.
+    """
+    reached = curve.returns >= curve.settings.threshold * curve.final
+    return curve.first(reached & curve.learned)
+
+
+def convergence_steps(curve: LearningCurve) -> Attained:
+    """The point where the slope of the moving average becomes minimal (paper).
+
+    Our reading: the first episode, once the average has come threshold of the way from random to
+    final, at which its slope is down to `convergence_slope` of the steepest so far. Censored:
+    never, or not `learned`.
+    """
+    settings, window = curve.settings, curve.settings.moving_average
+    high = curve.average >= curve.bar(curve.final)
+    learned = np.logical_or.accumulate(high)[window:]  # [E - 2 · window + 1], as the slopes
+    steepest = np.maximum.accumulate(curve.slopes)
+    minimal = curve.slopes <= settings.convergence_slope * steepest
+    return curve.first(learned & minimal & curve.learned, 2 * window)
+
+
+def convergence_steps_steepest(curve: LearningCurve) -> Attained:
+    """The first episode after the steepest rise at which the slope is no longer positive.
+
+    The steepest rise can be the recovery from a late collapse. Censored: never, or not `learned`.
+    """
+    window, slopes = curve.settings.moving_average, curve.slopes
+    if not (slopes > 0).any():
+        return Attained(len(curve.returns), True)
+    steepest = int(np.argmax(slopes))  # the first of equals
+    return curve.first((slopes[steepest:] <= 0) & curve.learned, 2 * window + steepest)
+
+
+def convergence_steps_flattest(curve: LearningCurve) -> Attained:
+    """The first episode at which the absolute slope is smallest in all of training.
+
+    The most literal reading: it finds the flat start of a run that has yet to learn, or chance on
+    the final plateau. Censored: E < 2 windows, or not `learned`.
+    """
+    magnitude = np.abs(curve.slopes)
+    flattest = magnitude == magnitude.min(initial=np.inf)
+    return curve.first(flattest & curve.learned, 2 * curve.settings.moving_average)
+
+
+def convergence_steps_public_code(curve: LearningCurve) -> Attained:
+    """The rule of the authors' public code, whatever the window configured here.
+
+    The first episode of the first 50-episode window past 30 % of training after which the moving
+    average changes by less than 0.05 per episode over 50 episodes: never less than 586 of 2000.
+    """
+    first = _public_code_first(PUBLIC_CODE_WINDOW, len(curve.returns))
+    flat = np.abs(slope(curve.returns, PUBLIC_CODE_WINDOW)[first - 1 :]) < PUBLIC_CODE_SLOPE
+    return curve.first(flat, first)
+
+
+def sample_efficiency_public_code(curve: LearningCurve) -> Attained:
+    """The rule of the authors' public code: the paper's, whose bar is of the last 10 episodes.
+
+    It asks no more of a run: one that has learned nothing may reach its bar in episode 1.
+    """
+    bar = curve.settings.threshold * np.mean(curve.returns[-PUBLIC_CODE_LAST:])
+    return curve.first(curve.returns >= bar)
+
+
+def sample_efficiency_common(curve: LearningCurve) -> Attained:
+    """The first episode whose moving average has come threshold of the way to the reference.
+
+    The bar is the same for every variant: ending worse does not lower it. Censored: never reached.
+    """
+    reached = curve.average >= curve.bar(curve.reference)
+    return curve.first(reached, curve.settings.moving_average)
+
+
+def sample_efficiency_range(curve: LearningCurve) -> Attained:
+    """The first episode whose moving average has come threshold of the way from random to final.
+
+    Censored: not `learned`.
+    """
+    reached = curve.average >= curve.bar(curve.final)
+    return curve.first(reached & curve.learned, curve.settings.moving_average)
+
+
+def convergence_steps_range(curve: LearningCurve) -> Attained:
+    """The first episode from which on the moving average stays within band · (final - random).
+
+    Censored: the average ends farther from the final return, or not `learned`.
+    """
+    settings, gain = curve.settings, curve.final - curve.random_mean
+    near = np.abs(curve.average - curve.final) <= settings.convergence_band * gain
+    settled = np.logical_and.accumulate(near[::-1])[::-1]
+    return curve.first(settled & curve.learned, settings.moving_average)
+
+
+def early_return(curve: LearningCurve) -> float:
+    """Mean return of the first episodes, as many as `last_part` has: how steep the curve begins."""
+    count = len(last_part(curve.returns, curve.settings.final_fraction))
+    return float(np.mean(curve.returns[:count]))
+
+
+def solved(curve: LearningCurve) -> float:
+    """The share of the last episodes (`last_part`) whose return is at least `solved_return`."""
+    return float(np.mean(last_part(curve.returns, curve.settings.final_fraction) >= curve.solved))
+
+
+def _public_code_first(window: int, episodes: int) -> int:
+    return int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1
+
+
+def _episodes(
+    function: Callable[[LearningCurve], Attained], label: str, windows: int, *needs: str
+) -> Metric:
+    name, earliest = function.__name__, lambda window, _: max(1, windows * window)
+    return Metric(name, label, "episodes", function, *needs, earliest=earliest)
+
+
+METRICS = (  # the area is under the learning curve, per episode
+    Metric("final_return", "Final return", "return", lambda curve: curve.final),
+    _episodes(sample_efficiency, "Sample efficiency", 0),
+    _episodes(convergence_steps, "Convergence", 2),
+    Metric("area_under_curve", "Mean return of training", "return", lambda c: c.returns.mean()),
+    Metric("early_return", "Mean return of the beginning", "return", early_return),
+    Metric("solved", "Solved at the end", "share", solved, "solved_return"),
+    _episodes(sample_efficiency_common, "Sample efficiency (common bar)", 1, "reference_return"),
+    _episodes(sample_efficiency_range, "Sample efficiency (range)", 1),
+    _episodes(convergence_steps_range, "Convergence (range)", 1),
+    _episodes(convergence_steps_steepest, "Convergence (steepest)", 2),
+    _episodes(convergence_steps_flattest, "Convergence (flattest)", 2),
+    replace(
+        _episodes(convergence_steps_public_code, "Convergence (public code)", 0),
+        earliest=_public_code_first,
+    ),
+    replace(
+        _episodes(sample_efficiency_public_code, "Sample efficiency (public code)", 0),
+        compared=False,
+    ),
+)
+
+
+def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
+    """Those of `METRICS` whose settings are there and, after them, those of `metrics.custom`.
+
+    Raises `ConfigError` for what is no metric.
+    """
+    metrics = [one for one in METRICS if one.needs is None or getattr(settings, one.needs)]
+    for reference in settings.custom:
+        metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
+        if not isinstance(metric, Metric):
+            problem = f"is no {__name__}.Metric but of type {type(metric).__name__}"
+        elif not metric.name.isidentifier():
+            problem = f"has the name {metric.name!r}, but a column's name should be a word"
+        elif {metric.name, metric.flag} & columns.keys():
+            problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
+        elif metric.unit not in COLUMN_TYPES:
+            units = ", ".join(COLUMN_TYPES)
+            problem = f"has the unit {metric.unit!r}, but should have one of {units}"
+        else:
+            metrics.append(metric)
+            continue
+        raise ConfigError(f"metrics.custom has {reference!r}, which {problem}")
+    return tuple(metrics)
+
+
+def metric_units(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.unit for metric in all_metrics(settings)}
+
+
+def metric_labels(settings: MetricsConfig) -> dict[str, str]:
+    """Of each metric, by its name."""
+    return {metric.name: metric.label for metric in all_metrics(settings)}
+
+
+def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
+    """The columns of metrics.csv, one row per run, with these metrics."""
+    run = {"env": str, "variant": str, "seed": int, "episodes": int, "env_steps": int}
+    values = {metric.name: COLUMN_TYPES[metric.unit] for metric in metrics}
+    return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
+
+
+def metrics_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) -> "pd.DataFrame":
+    """One row of `metrics_columns` per run, in the order of `runs`."""
+    import pandas as pd
+
+    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
+    _check_attained("the table of metrics", table, all_metrics(settings))
+    return table
+
+
+def metrics_of_run(
+    frame: "pd.DataFrame", run: RunKey, settings: MetricsConfig
+) -> dict[str, str | int | float]:
+    """The row of metrics.csv of one run, from its records."""
+    environment, variant, seed = run
+    curve = learning_curve(frame, environment, settings)
+    row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
+    row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
+    metrics = all_metrics(settings)
+    for metric in metrics:
+        value = metric.function(curve)
+        if metric.unit == "episodes" and isinstance(value, Attained):
+            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
+        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
+            row[metric.name] = float(value)
+        else:
+            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
+            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
+    return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def learning_curve(
+    frame: "pd.DataFrame", environment: str, settings: MetricsConfig
+) -> LearningCurve:
+    """What the metrics see of the run with these records (`read_episodes`)."""
+    returns = frame["extrinsic_return"].to_numpy()
+    final = final_return(returns, settings.final_fraction)
+    random = settings.random_return_in(environment)
+    goals = [goal[environment] if goal else math.nan for goal in settings.goals]
+    return LearningCurve(returns, final, random, settings, *goals)
+
+
+def read_metrics(
+    path: str | Path, runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> "pd.DataFrame":
+    """Read metrics.csv; `RecordError` unless it has a possible row for each of `runs`, in order.
+
+    runs: of each its environment, variant, seed and number of episodes.
+    """
+    metrics = all_metrics(settings)
+    table = read_table(path, metrics_columns(metrics))
+    found = table[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
+    for line, (run, right) in enumerate(zip_longest(found, map(tuple, runs)), start=2):
+        if run != right:
+            raise RecordError(f"{path}: line {line}: the run {run} stands where {right} belongs")
+    _check_attained(str(path), table, metrics)
+    return table
+
+
+def _check_attained(origin: str, table: "pd.DataFrame", metrics: Sequence[Metric]) -> None:
+    """Refuse episodes outside of training, and flags that contradict them."""
+    for metric in (metric for metric in metrics if metric.unit == "episodes"):
+        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
+        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
+        if not right.all():
+            row = int(np.argmin(right))
+            raise RecordError(
+                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
+                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
+            )
+
+
+def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:
+    """Sum of each `window` consecutive values: exact for whole numbers, so that ties are ties."""
+    if len(values) < window:
+        return np.empty(0)
+    return np.lib.stride_tricks.sliding_window_view(values, window).sum(axis=-1)

@@ -1,0 +1,167 @@
+"""The sections of a study, each a title, a note and a table: what its pages are made of."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from mace_rl.training.records import read_table
+from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
+from mace_study.compare.comparisons import ALL
+from mace_study.compare.estimates import POWER
+from mace_study.compare.ledger import Answer, read_ledger
+from mace_study.compare.summary import from_to
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.betas import CORRELATIONS, LABELS, betas_columns
+from mace_study.measure.metrics import read_metrics
+from mace_study.show import tables
+
+TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
+RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
+PARTS = (
+    "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
+    " *p*: of no difference; *p within*: of one beyond the margin; both corrected for all"
+    " parts. *P*: that a run of the first is better. *Margin*: what is worth mentioning."
+    f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
+    " correction."
+    " *Room*: how much better than the second any run could be, or is. *One seed*: where our"
+    " difference would lie if the paper's, of one run each, differed from it by chance."
+)
+
+Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
+
+
+class Section(NamedTuple):
+    """A table and what is to be said of it; in the note, words between asterisks are italic."""
+
+    title: str
+    note: str
+    frame: pd.DataFrame
+    level: int = 2
+
+
+def read_data(
+    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> tuple[dict[str, pd.DataFrame], list[Answer]]:
+    """The data of these runs, and the ledger, empty without one, from files by their names."""
+    # Names are as they were given, NA and 0.1 too; an empty cell is NaN.
+    how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
+    files = {name: path for name, path in found.items() if str(path).endswith(".csv")}
+    data = {name: pd.read_csv(path, **how) for name, path in files.items()}
+    if "metrics" in found:
+        data["metrics"] = read_metrics(found["metrics"], runs, settings)
+    if "betas" in found:
+        data["betas"] = read_table(found["betas"], betas_columns(settings))
+    return data, read_ledger(found["ledger"]) if "ledger" in found else []
+
+
+def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
+    """The answers of each family that has been asked."""
+    titles = dict.fromkeys(answer.family for answer in answers)
+    return {title: [one for one in answers if one.family == title] for title in titles}
+
+
+def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
+    """How many claims of one family have which verdict, in words."""
+    counts = Counter(answer.ways[how].verdict for answer in answers)
+    words = claims.families[answers[0].family].words.model_dump().values()
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
+
+
+def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
+    """Family by family the verdicts, and then the parts in each way to measure them."""
+    for title, own in by_family(answers).items():
+        verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
+        note = f"Of {len(own)}, {verdicts}. The rule: docs/metrics.md."
+        ways = [way for answer in own for way in answer.ways.values()]
+        seeds = min(part.seeds for way in ways for part in way.parts)
+        if seeds < FEWEST_SEEDS:
+            note += f" No claim can have a verdict: {too_few(seeds)}."
+        yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
+        for how in own[0].ways:
+            frame = tables.parts(own, how, {})
+            yield Section(f"Part by part: {how}", PARTS, frame, level=3)
+
+
+def of_runs(
+    data: Data, claims: ClaimsConfig, settings: MetricsConfig, names: Mapping[str, str]
+) -> list[Section]:
+    """Everything but the ledger, with these names of the variants."""
+    data = {name: tables.named(frame, names) for name, frame in data.items()}
+    asked = [
+        (key.partition(".")[0], one.metric)
+        for own in claims.families.values()
+        for key, one in parts_of(own)
+    ]
+    found = [*_means(data, claims, settings), *_compared(data, settings)]
+    found += _others(data, settings, asked)
+    note = f"Mean over seeds ({100 * settings.confidence:g} % interval)."
+    for environment, frame in tables.companions(data["supplement"], settings).items():
+        found.append(Section(f"The other metrics: {environment}", note, frame))
+    return found
+
+
+def _means(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> Iterator[Section]:
+    """What each variant reached in each environment."""
+    runs, supplement, paper = data["metrics"], data["supplement"], claims.table1
+    interval = f"{100 * settings.confidence:g} % interval"
+    seeds = from_to(runs.groupby(["env", "variant"]).size())
+    for metric, title in RETURNS.items():
+        if metric not in paper.metrics:
+            frame = tables.means(supplement, metric, settings)
+            yield Section(title, f"Mean over {seeds} seeds ({interval}).", frame)
+    yield Section("Final return of the worst seed", "", tables.worst(runs, settings))
+    if "solved" in runs:
+        note = f"Seeds whose last episodes are solved in {tables.SOLVED:.0%} of the cases or more."
+        yield Section("Seeds that solve", note, tables.solved(runs))
+    note = f"{paper.caption}: mean over seeds ({interval}), the best bold."
+    if tables.counts_episodes(settings, paper):
+        note = (
+            f"{paper.caption} in episodes, lower is better: mean over seeds ({interval}), the"
+            f" lowest bold. †k: k {tables.CENSORED}, so the mean is a lower bound."
+        )
+    yield Section("Table 1", note, tables.table1(data["table1"], settings, paper))
+
+
+def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
+    """One variant against another."""
+    table, means = data["comparisons"], pd.concat([data["table1"], data["supplement"]])
+    for metric, title in RETURNS.items() if len(table) else ():
+        note = "P: that a run of the first is better than one of the second; 0.5 is a coin's toss."
+        yield Section(f"{title}: who is better", note, tables.improvement(table, metric))
+        note = (
+            "Difference: mean over the seeds that both have (interval). p: of the sign-flip test,"
+            " by itself and corrected for all metrics, pairs and environments (comparisons.csv);"
+            " verdicts have a correction of their own."
+        )
+        own = table[(table["metric"] == metric) & (table["env"] != ALL)]
+        frame = tables.comparisons(own, means, settings)
+        yield Section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
+
+
+def _others(
+    data: Data, settings: MetricsConfig, asked: Sequence[tuple[str, str]]
+) -> Iterator[Section]:
+    """All environments together, readings and β; asked: claims with metrics that they compare."""
+    if data["metrics"]["env"].nunique() > 1:
+        note = "Scores: 0 is the random policy, 1 the study's best run."
+        yield Section("All environments together", note, tables.aggregate(data["aggregate"]))
+    if "readings" in data:
+        note = (
+            "Means in episodes, the lowest first; bold if a log-rank test against each of the"
+            " others has p < 0.05, not corrected. †: some runs never got there."
+        )
+        frame = tables.readings(data["readings"], settings)
+        yield Section("What decides the ranking", note, frame)
+    frame = tables.betas(data["betas"], settings)
+    if len(frame):
+        note = (
+            "Where β is not the same in every seed: of all seeds the least, the median and the"
+            " most. With stagnation: mean over seeds of its rank correlation with the stagnation"
+            " of the episodes before, in all of training, and before and after the common bar."
+        )
+        for name in [name for name in CORRELATIONS if name in data["betas"]]:
+            if judged := dict.fromkeys(claim for claim, metric in asked if metric == name):
+                note += f" Of {', '.join(judged)} it is the column *{LABELS[name]}*."
+        yield Section("β", note, frame)

@@ -1,0 +1,345 @@
+"""Every table of a study, as a frame of words (`str`) and `Cell`s of numbers with intervals."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
+from mace_rl.runs.progress import duration
+from mace_study.compare.claims_config import Table1Config, Table2Config
+from mace_study.compare.ledger import Answer, Finding
+from mace_study.compare.readings import in_order, ranked, title
+from mace_study.compare.statistics import interval
+from mace_study.compare.summary import digits_by_metric
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.betas import CORRELATIONS, LABELS
+from mace_study.measure.metrics import metric_labels, metric_units
+
+COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
+DASH = "\u2013"  # in the place of a number that there is not
+SIZES = ("room", "margin", "detectable")  # beside a difference
+CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
+POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
+SOLVED = 0.9  # of the last episodes, for a seed to count
+
+
+class Value(NamedTuple):
+    """One number, or words, as printed."""
+
+    text: str
+    low: str = ""  # of its interval; empty where none is asked for
+    high: str = ""
+    mark: str = ""  # †, and of how many seeds
+    best: bool = False
+
+
+class Cell(NamedTuple):
+    """Several values in one cell, and a note beside them. (Words alone are a `str`.)"""
+
+    values: Sequence[Value]
+    joint: str = " / "
+    note: str = ""
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """A number with a true minus, and without one before a zero; a dash where there is none."""
+    if value is None or np.isnan(value):
+        return DASH
+    return f"{value:z.{digits}f}".replace("-", "−")
+
+
+def estimate(value: Iterable[Any], digits: int, mark: str = "", best: bool = False) -> Value:
+    """A number, low and high of its interval, as printed; dashes where there is none."""
+    text, low, high = (number(one, digits) for one in value)
+    return Value(text, low, high, mark, best)
+
+
+def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
+    """A study's data with other names of its variants."""
+    columns = table.columns.intersection(["variant", "baseline"])
+    return table.assign(**{column: table[column].replace(dict(names)) for column in columns})
+
+
+def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) -> pd.DataFrame:
+    """Table 1 in the paper's layout, of the data of table1.csv: its metrics side by side.
+
+    Rows are variants, columns environments. The best mean of each environment and metric is bold,
+    as displayed: ties all are; a mean of seeds that all never got there is not.
+    """
+    digits, units = digits_by_metric(table, settings), metric_units(settings)
+    best: dict[Any, str] = {}
+    attained = table[table["censored"] < table["seeds"]]
+    for (env, metric), means in attained.groupby(["env", "metric"])["mean"]:
+        first = means.min() if units[str(metric)] == "episodes" else means.max()
+        best[env, metric] = number(first, digits[str(env), str(metric)])
+
+    def cell(runs: pd.DataFrame) -> Cell:
+        values, published = [], []
+        for metric in paper.metrics:
+            row = runs[runs["metric"] == metric].iloc[0]
+            key = row["env"], metric
+            shown = number(row["mean"], digits[key])
+            is_best = row["censored"] < row["seeds"] and shown == best[key]
+            values.append(_mean(row, digits[key], is_best))
+            published += [] if pd.isna(row["paper"]) else [number(row["paper"], digits[key])]
+        return Cell(values, note=f"paper: {' / '.join(published)}" if published else "")
+
+    return _grid(table, cell, "Algorithm")
+
+
+def counts_episodes(settings: MetricsConfig, paper: Table1Config) -> bool:
+    """Whether all metrics of Table 1 do, of which fewer are better."""
+    return all(metric_units(settings)[metric] == "episodes" for metric in paper.metrics)
+
+
+def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.DataFrame]:
+    """By environment, a row for each metric of a `summary` and a column for each variant."""
+    digits = digits_by_metric(table, settings)
+    labelled = table.assign(label=table["metric"].map(metric_labels(settings)))
+
+    def cell(rows: pd.DataFrame) -> Cell:
+        values = [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
+        return Cell(values)
+
+    groups = labelled.groupby("env", sort=False)
+    return {str(env): _grid(own, cell, rows="label", columns="variant") for env, own in groups}
+
+
+def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
+    """One metric of a `summary`, a row for each variant and a column for each environment."""
+    digits, own = digits_by_metric(table, settings), table[table["metric"] == metric]
+    return _grid(own, lambda rows: Cell([_mean(rows.iloc[0], digits[rows["env"].iloc[0], metric])]))
+
+
+def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """The final return of each variant's worst seed, from the frame of metrics.csv."""
+    table = runs.assign(metric="final_return", mean=runs["final_return"])
+    digits = {env: count for (env, _), count in digits_by_metric(table, settings).items()}
+    return _grid(table, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0]]))
+
+
+def solved(runs: pd.DataFrame) -> pd.DataFrame:
+    """How many seeds solve each task, from the frame of metrics.csv."""
+    return _grid(runs, lambda own: f"{int((own['solved'] >= SOLVED).sum())} of {len(own)}")
+
+
+def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
+    digits, labels = digits_by_metric(means, settings), metric_labels(settings)
+    rows = []
+    for _, row in table.iterrows():
+        # All environments together have no digits, and no values that would need them.
+        shown = digits.get((row["env"], row["metric"]), 0)
+        own = [row["env"], labels[row["metric"]], f"{row['variant']} over {row['baseline']}"]
+        own += [_number(row["seeds"]), _estimate(row, "difference", shown, ends="")]
+        own += [_number(row["p_value"], 4), _number(row["p_holm"], 4)]
+        rows.append([*own, _estimate(row, "probability", 2)])
+    heads = ["environment", "metric", "", "n", "difference", "p", "p (Holm)", "P"]
+    return pd.DataFrame(rows, columns=heads)
+
+
+def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """The probabilities of comparisons.csv: a row for each pair, a column for each environment."""
+    own = table.assign(pair=table["variant"] + " over " + table["baseline"])
+    own = own[own["metric"] == metric]
+    return _grid(own, lambda rows: _estimate(rows.iloc[0], "probability", 2), rows="pair")
+
+
+def aggregate(table: pd.DataFrame) -> pd.DataFrame:
+    """aggregate.csv."""
+    rows = []
+    for _, row in table.iterrows():
+        own = [row["variant"], row["metric"].replace("_", " "), _number(row["runs"])]
+        rows.append([*own, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
+    return pd.DataFrame(rows, columns=["", "score of", "runs", "mean", "interquartile mean"])
+
+
+def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """Of each reading (`readings.csv`) and environment the variants, the first one first.
+
+    The best is a first place that is more than chance (`ranked`).
+    """
+
+    def cell(rows: pd.DataFrame) -> Cell:
+        ordered, is_first = ranked(rows)
+        values = [
+            Value(f"{row['variant']} {number(row['mean'])}", mark="†" if row["censored"] else "")
+            for _, row in ordered.iterrows()
+        ]
+        return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
+
+    parts = [own.assign(title=title(*key, metric_labels(settings))) for key, own in in_order(table)]
+    frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
+    return frame[["episodes", *table["env"].unique()]]
+
+
+def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """betas.csv: the variants whose β is not the same in every seed, and how it ended."""
+    rows: list[dict[str, str | Cell]] = []
+    for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
+        if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
+            continue
+        rows.append({"environment": str(environment), "": str(variant), "n": _number(len(runs))})
+        for name in runs.columns.intersection(list(LABELS), sort=False):
+            found = runs[name].to_numpy()
+            if name in CORRELATIONS:
+                ends = map(float, interval(found, settings))
+                shown: str | Cell = Cell([estimate((found.mean(), *ends), 3)])
+            else:
+                shown = ", ".join(number(beta, 2) for beta in np.quantile(found, [0, 0.5, 1]))
+            rows[-1][LABELS[name]] = shown
+    return pd.DataFrame(rows)
+
+
+def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
+    """A verdict for each claim of one family, in each way to measure it."""
+    ways = list(answers[0].ways)
+    rows = []
+    for answer in answers:
+        said = [Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways]
+        rows.append([answer.claim, answer.statement, *said, answer.paper])
+    frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
+    return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
+
+
+def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.DataFrame:
+    """Every part of the claims, measured in one of the ways, with these `names`, if any."""
+    rows = []
+    for answer, part in ((one, part) for one in answers for part in one.ways[how].parts):
+        # Of a return as many as the margin needs, which depends on the environment's scale.
+        of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
+        digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
+        pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
+        environment = "all" if len(part.environments) > 1 else part.environments[0]
+        sizes = part.in_paper, part.worth_mentioning, part.detectable
+        row: list[str | Cell] = [answer.claim, environment, names.get(part.metric, part.metric)]
+        row += [" over ".join(pair), _number(part.seeds)]
+        row += [_estimate(vars(part), "difference", digits, ends="")]
+        row += [_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)]
+        row += [_estimate(vars(part), "probability", 2), *(_number(one, digits) for one in sizes)]
+        row += _by_size(part, digits)
+        rows.append(row)
+    heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
+    heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
+    return pd.DataFrame(rows, columns=[*heads, ""])
+
+
+def _by_size(part: Finding, digits: int) -> list[str | Cell]:
+    """Room, replication, size and outcome of a part."""
+    ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
+    chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
+    outcome = part.outcome.replace("_", " ")
+    return [_number(part.room, max(1, digits)), chance, part.replication, part.size, outcome]
+
+
+def side_by_side(studies: Mapping[str, Sequence[Answer]], how: str) -> pd.DataFrame:
+    """`parts` of several studies in short, each study in a column."""
+    part, columns = ["", "environment", "metric", "over"], []
+    for answers in studies.values():
+        frame = parts(answers, how, {})
+        frame = frame.set_axis([*part, *frame.columns[4:-1], "outcome"], axis=1).set_index(part)
+        columns.append(pd.Series([_in_short(row) for _, row in frame.iterrows()], frame.index))
+    return pd.concat(columns, axis=1, keys=studies, sort=False).fillna("").reset_index()
+
+
+def _in_short(part: pd.Series) -> Cell:
+    size = f", {part['size']}" if part["outcome"] in ("shown", "reversed") else ""
+    numbers = (f"{name} {part[name].values[0].text}" for name in ("n", *SIZES))
+    return part["difference"]._replace(note=f"{', '.join(numbers)}: {part['outcome']}{size}")
+
+
+def costs(
+    records: Sequence[Mapping[str, Any]], runs: pd.DataFrame, labels: Mapping[str, str]
+) -> pd.DataFrame:
+    """What the runs of each environment and variant took, by their `run.json`."""
+    frame = pd.DataFrame(record["config"] | record for record in records)
+    frame = frame[["environment", "variant", "seed", "seconds", "peak_memory_mb"]]
+    frame = frame.rename(columns={"environment": "env"})
+    frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
+    rows = []
+    for (env, variant), own in frame.groupby(["env", "variant"], sort=False):
+        row = [env, labels[str(variant)], number(len(own)), number(own["env_steps"].sum() / 1000)]
+        row += [duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")]
+        rows.append([*row, number(own["peak_memory_mb"].max())])
+    heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
+    return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
+
+
+def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
+    """The PPO hyperparameters: the paper's rows and Adam, then this project's further settings."""
+    own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
+    rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
+    rows += [["Optimizer", "Adam"]]
+    others = [name for name in PPOConfig.model_fields if name not in paper.rows]
+    rows += [[own[name], _setting(ppo, name)] for name in others]
+    return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
+
+
+def _grid(
+    table: pd.DataFrame,
+    cell: Callable[[pd.DataFrame], str | Cell],
+    head: str = "",
+    rows: str = "variant",
+    columns: str = "env",
+) -> pd.DataFrame:
+    """A row for each of `rows` and a column for each of `columns`; empty where there is nothing."""
+    groups = dict(list(table.groupby([rows, columns], sort=False)))
+    across = list(table[columns].unique())
+    lines = [
+        [name, *(cell(groups[name, other]) if (name, other) in groups else "" for other in across)]
+        for name in table[rows].unique()
+    ]
+    return pd.DataFrame(lines, columns=[head, *across])
+
+
+def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:
+    """A row of a `summary`, with the number of seeds that never got there."""
+    mark = f"†{row['censored']}" if row["censored"] else ""
+    return estimate(row[["mean", "low", "high"]], digits, mark, best)
+
+
+def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell:
+    """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
+    prefix = f"{name}_" if ends is None else ends
+    return Cell([estimate((row[name], row[f"{prefix}low"], row[f"{prefix}high"]), digits)])
+
+
+def _number(value: float | None, digits: int = 0) -> Cell:
+    return Cell([Value(number(value, digits))])
+
+
+def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
+    """The value of one setting, for each group of environments that share it."""
+    environments: dict[str, list[str]] = {}
+    for environment, config in ppo.items():
+        value = getattr(config, name)
+        text = "none" if value is None and name == "max_gradient_norm" else _value(value)
+        environments.setdefault(text, []).append(environment)
+    if len(environments) == 1:
+        return next(iter(environments))
+    values = [Value(f"{value} ({', '.join(whose)})") for value, whose in environments.items()]
+    return Cell(values, joint="; ")
+
+
+def _value(value: Any) -> str:
+    """A setting as it is printed."""
+    match value:
+        case None:
+            return "all steps of the update"
+        case bool():
+            return "yes" if value else "no"
+        case list():
+            return ", ".join(map(_value, value))
+        case CompiledNetwork():
+            return "tanh network"
+        case TorchModule():
+            return value.module
+        case float() if "e" in repr(value):
+            mantissa, exponent = repr(value).split("e")
+            power = str(int(exponent)).translate(str.maketrans("-0123456789", POWERS))
+            return f"{mantissa} \u00d7 10{power}"
+        case _:
+            return str(value)

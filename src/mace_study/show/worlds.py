@@ -1,0 +1,157 @@
+"""Pictures of several studies of the same claims: each a *world* (docs/worlds-protocol.md)."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from mace_study.compare.claims_config import Table1Config
+from mace_study.compare.ledger import Answer, Judgement
+from mace_study.show.curves import (
+    LEGEND_HEIGHT,
+    PlotStyle,
+    Quantity,
+    draw_means,
+    grid,
+    legend,
+    style,
+)
+from mace_study.show.pictures import INK, OUTCOMES, wrapped
+
+LINE = 0.15  # inches
+SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
+# From seaborn's palette that the colour-blind can tell apart; none is a verdict's.
+COLOURS = ("#949494", "#56b4e9", "#ca9161")
+
+
+def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
+    """A row per way of measuring, claim and world.
+
+    Columns: measured (in which way), claim, statement, world, outcome, verdict, parts, shown (how
+    many of these), worth (how many of those are worth mentioning), least_room and most_room (of its
+    parts, in margins).
+    """
+    rows = [
+        (how, answer.claim, answer.statement, world, *_counted(judged))
+        for world, answers in worlds.items()
+        for answer in answers
+        for how, judged in answer.ways.items()
+    ]
+    names = ["measured", "claim", "statement", "world", "outcome", "verdict", "parts", "shown"]
+    return pd.DataFrame(rows, columns=[*names, "worth", "least_room", "most_room"])
+
+
+def _counted(judged: Judgement) -> tuple[Any, ...]:
+    parts = judged.parts
+    shown = [part for part in parts if part.outcome == "shown"]
+    worth = sum(part.size == "worth mentioning" for part in shown)
+    room = [part.room / part.worth_mentioning for part in parts]
+    return judged.outcome, judged.verdict, len(parts), len(shown), worth, min(room), max(room)
+
+
+def draw_verdicts(table: pd.DataFrame) -> Figure:
+    """A cell per claim and world in the verdict's colour; in it what is shown, and the room."""
+    claims = table.drop_duplicates("claim")
+    named = zip(claims["claim"], claims["statement"], strict=True)
+    said = {claim: wrapped(f"{claim} {statement}", 46) for claim, statement in named}
+    heights = np.array([max(2, text.count("\n") + 1) + 0.5 for text in said.values()])
+    tops = dict(zip(said, np.cumsum(heights) - heights, strict=True))
+    small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
+    worlds = list(table["world"].unique())
+    with style():
+        figure, (axes,) = grid(1, 1, height=LINE * heights.sum() + LEGEND_HEIGHT)
+        for place, (claim, text) in enumerate(said.items()):
+            axes.text(-0.03, tops[claim] + heights[place] / 2, text, ha="right", **small)
+        rows: Any = table.itertuples()
+        for row in rows:
+            left, height = worlds.index(row.world), heights[list(said).index(row.claim)]
+            colour, _ = OUTCOMES[row.outcome]
+            size = f", {row.worth} worth mentioning" if row.shown else ""
+            room = " to ".join(
+                dict.fromkeys(f"{one:.3g}" for one in (row.least_room, row.most_room))
+            )
+            lines = f"{row.verdict}\n{row.shown} of {row.parts} shown{size}\nroom: {room} margins"
+            area = (
+                (left, left + 0.97),
+                (tops[row.claim] + 0.05,) * 2,
+                (tops[row.claim] + height,) * 2,
+            )
+            axes.fill_between(*area, color=colour, alpha=0.25, linewidth=0)
+            axes.text(left + 0.485, tops[row.claim] + height / 2, lines, ha="center", **small)
+        axes.set(xlim=(-1.6, len(worlds)), ylim=(heights.sum(), 0), yticks=[])
+        axes.set_xticks(np.arange(len(worlds)) + 0.485, worlds)
+        axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False)
+        axes.spines[:].set_visible(False)
+        legend(figure, "A margin is what would be worth mentioning.")
+    return figure
+
+
+def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: PlotStyle) -> Figure:
+    """Every seed of every world as a dot, a strip for each; the paper's number across them.
+
+    runs: by world the frame of metrics.csv.
+    """
+    seen = set().union(*(table["env"] for table in runs.values()))
+    environments = [env for env in table1.values if env in seen]
+    middles = np.arange(len(table1.variants)) * (len(runs) + 1) + (len(runs) - 1) / 2
+    jitter = np.random.default_rng(0)
+    with style():
+        cells = list(itertools.product(environments, enumerate(table1.public_code)))
+        width = len(table1.public_code)
+        figure, panels = grid(len(cells), width, "Training episodes", height=2.0)
+        for (env, (column, metric)), axes in zip(cells, panels, strict=True):
+            for middle, variant in zip(middles, table1.variants, strict=True):
+                for number, (world, table) in enumerate(runs.items()):
+                    own = table[(table["env"] == env) & (table["variant"] == variant)][metric]
+                    place = middle + number - (len(runs) - 1) / 2
+                    dots: dict[str, Any] = {"s": 5, "linewidth": 0, "alpha": 0.7, "label": world}
+                    places = place + jitter.uniform(-0.3, 0.3, len(own))
+                    axes.scatter(own, places, color=COLOURS[number], **dots)
+                ends = middle - len(runs) / 2, middle + len(runs) / 2
+                paper = table1.values[env][variant][column]
+                axes.vlines(paper, *ends, color=INK, linewidth=1.3, label="the paper's number")
+            least, most = axes.dataLim.intervalx
+            if most > SEVERAL * least:
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter("{x:.0f}")
+                axes.minorticks_off()
+            else:
+                axes.locator_params(axis="x", nbins=4)
+            axes.set_title(f"{env}: {look.metrics[metric].lower()}")
+            names = ["" if column else look.labels[name] for name in table1.variants]
+            axes.set_yticks(middles, names)
+            axes.invert_yaxis()
+        legend(figure, "Dot: one seed.")
+    return figure
+
+
+def draw_curves(curves: Mapping[str, pd.DataFrame], shown: Quantity, look: PlotStyle) -> Figure:
+    """The mean curves of Figure 1 with their intervals, a row per world; by world figure1.csv."""
+    environments = list(
+        dict.fromkeys(env for own in curves.values() for env in own["env"].unique())
+    )
+    with style():
+        count = len(environments) * len(curves)
+        names = "Training episodes", shown.label
+        figure, panels = grid(count, len(environments), *names, height=1.7)
+        places = iter(panels)
+        for world, own in curves.items():
+            for env in environments:
+                axes, means = next(places), own[own["env"] == env]
+                if means.empty:
+                    axes.set_axis_off()
+                    continue
+                axes.set_title(f"{env}, {world}")
+                axes.locator_params(nbins=4)
+                draw_means(axes, means, look)
+        for column, _ in enumerate(environments):
+            for axes in panels[column + len(environments) :: len(environments)]:
+                axes.sharey(panels[column])
+                axes.sharex(panels[column])
+        legend(figure, f"Line: mean over seeds. Band: its {100 * look.confidence:g} % interval.")
+    return figure
