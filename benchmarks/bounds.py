@@ -67,12 +67,12 @@ class Work:
         counted(trainer, "play", lambda episode, *_: self.network(sizes, 1, len(episode)))
         counted(
             compiled_learner,
-            "improve_policy",
+            "update_policy",
             lambda _, batch, order, sizes, *rest: self.update(order, sizes, rest[-1]),
         )
         counted(
             compiled_learner,
-            "improve_values",
+            "update_critic",
             lambda _, seen, returns, order, sizes, adam: self.update(order, sizes, adam),
         )
         counted(

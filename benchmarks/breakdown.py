@@ -30,7 +30,7 @@ SECTIONS = {
     "environment": "environment.env.unwrapped.reset environment.env.step",
     "acting": "",  # see `instrument` and `FUNCTIONS`, as for the updates
     "bookkeeping": "",
-    "critics' values, advantages": "ppo.advantages_and_returns",
+    "critics' values, advantages": "ppo.advantages",
     "update: actor": "",
     "update: critics": "",
 }
@@ -38,15 +38,15 @@ BONUS = {
     "novelty: k-NN": "curiosity.novelty.knn_novelty curiosity.novelty._replace_redundant",
     "novelty: density": "curiosity.novelty.density_novelty curiosity.novelty.refresh",
     "memory": "curiosity.memory.recall curiosity.memory.write",
-    "meta network": "controller.next_episode adapt",
+    "meta network": "controller.next_episode meta_update",
 }
 ALL_SECTIONS = list(SECTIONS | BONUS)
 # Functions of modules: section, module, name.
 FUNCTIONS = (
     ("acting", "mace_rl.training.trainer", "draw_noise"),
     ("acting", "mace_rl.agent.policy", "act_box"),
-    ("update: actor", "mace_rl.agent.compiled_learner", "improve_policy"),
-    ("update: critics", "mace_rl.agent.compiled_learner", "improve_values"),
+    ("update: actor", "mace_rl.agent.compiled_learner", "update_policy"),
+    ("update: critics", "mace_rl.agent.compiled_learner", "update_critic"),
     ("memory", "mace_rl.bonus.curiosity", "relevance"),
 )
 

@@ -121,16 +121,16 @@ def kill(monkeypatch):
     from mace_rl.runs import run
     from mace_rl.training.trainer import Trainer
 
-    improve = Trainer.improve
+    update = Trainer.ppo_update
 
     def start(number: int, config: RunConfig, directory: Path) -> None:
-        def improve_or_die(self, rollout):
+        def update_or_die(self, rollout):
             if len(self.diagnostics) == number - 1:
                 raise Killed
-            return improve(self, rollout)
+            return update(self, rollout)
 
         with monkeypatch.context() as patched:
-            patched.setattr(Trainer, "improve", improve_or_die)
+            patched.setattr(Trainer, "ppo_update", update_or_die)
             with pytest.raises(Killed):
                 run.run(config, directory)
 

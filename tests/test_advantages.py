@@ -55,7 +55,7 @@ def test_truncation_alone_bootstraps(make_ppo, kind, gae_lambda, terminated, sca
     values = Twin(ppo.critics[kind])(observations)[:, 0].detach().numpy()
     worth = 0.0 if terminated else values[5]
     assert abs(values[5]) > 0.05
-    found, returns = ppo.advantages_and_returns(kind, observations, paid, terminated)
+    found, returns, _ = ppo.advantages(kind, observations, paid, terminated)
     assert (ppo.advantage_scale(kind) == 1) != scaled
     # Backwards, the λ-return is r + γ ((1 − λ) V(s') + λ the next λ-return).
     following = worth
@@ -96,7 +96,7 @@ def test_scales_of_several_episodes(make_ppo, kind, smallest, least, unit):
     for rewards in unit * np.array([[4.0, -4.0], [0.0, 0.0], [8.0, -8.0]]):
         paid += rewards.tolist()
         expected = rewards / max(np.std(paid), smallest)
-        found, _ = ppo.advantages_and_returns(kind, np.zeros((3, 4)), rewards, True)
+        found = ppo.advantages(kind, np.zeros((3, 4)), rewards, True).advantages
         np.testing.assert_allclose(found, expected)
         seen += expected.tolist()
         mean_square = np.mean(np.square(seen))

@@ -7,7 +7,7 @@ import pytest
 from shared import ROOT, environment_of, finish
 
 from mace_rl.base.rng import Streams
-from mace_rl.beta.controller import Effect
+from mace_rl.beta.controller import BetaGradient
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
@@ -108,7 +108,7 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
     for n in range(200):
         direction = np.array([1.0, 0.5 * rng.standard_normal()], np.float32)
         gradient = np.array([1.0 if n > 40 else -1.0, rng.standard_normal()], np.float32)
-        credit = controller.learn(gradient, 1.0, Effect(direction, 1.0))
+        credit = controller.learn(gradient, 1.0, BetaGradient(direction, 1.0))
         credits += [] if credit is None else [credit]
         expected = len(credits) * 200 / max(n, 1)  # of the whole training
         z = sum(credits) / math.sqrt(max(np.square(credits).sum(), expected / 2, 1e-9))
@@ -144,7 +144,7 @@ def test_a_bonus_that_hardly_weighed_counts_for_little_and_a_heavy_one_for_one(m
     ):
         controller = make(horizon=1)
         controller.next_episode(episode_of(1), np.full(8, 0.5))
-        effect = Effect(gradient, advantage_rms)
+        effect = BetaGradient(gradient, advantage_rms)
         credits = [controller.learn(strength * gradient, strength, effect) for _ in range(3)]
         # The gradient goes the effect's way, always as far: in its usual size, by 1.
         assert credits == [None, pytest.approx(expected), pytest.approx(expected)]

@@ -75,13 +75,13 @@ def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch
                 run.run(other, directory)
             assert content_of(directory) == before
             with pytest.raises(Killed):
-                patched.setattr(Trainer, "improve", Mock(side_effect=Killed))
+                patched.setattr(Trainer, "ppo_update", Mock(side_effect=Killed))
                 run.run(other, directory, aside="others")  # as the workflow does
         aside = directory / f"_aside{number}"
         assert message in caplog.text and content_of(aside) == before
         shutil.copytree(aside, directory, dirs_exist_ok=True)
     with pytest.raises(Killed), monkeypatch.context() as patched:
-        patched.setattr(Trainer, "improve", Mock(side_effect=Killed))
+        patched.setattr(Trainer, "ppo_update", Mock(side_effect=Killed))
         run.run(config, directory, aside="all")
     assert content_of(directory) == {} and content_of(directory / "_aside6") == before
     run.run(config, directory / "_aside6")

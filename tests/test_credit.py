@@ -92,11 +92,11 @@ class Watched(Trainer):
         super().__init__(config)
         self.rounds: list[Round] = []
 
-    def adapt(self, rollout: list[Experience]) -> float | None:
+    def meta_update(self, rollout: list[Experience]) -> float | None:
         learner = self.ppo.learner
         policy = learner.parameters["actor"].copy()
         unit = 1 / learner.preconditioned(np.ones(len(policy), np.float32))
-        credit = super().adapt(rollout)
+        credit = super().meta_update(rollout)
         direction = self.controller.judge.directions[-1].copy()
         self.rounds.append(Round(rollout, policy, unit, direction))
         return credit
@@ -147,7 +147,7 @@ def policy_gradient(watched, each: Round, advantages: np.ndarray) -> np.ndarray:
 
 def scaled(item: Experience, kind: str) -> np.ndarray:
     """Advantages of one kind in units of their scale."""
-    return getattr(item, f"{kind}_advantages") / getattr(item, f"{kind}_scale")
+    return item.evaluations[kind].advantages / item.evaluations[kind].scale
 
 
 def test_direction_is_how_the_update_moves_with_beta(watched):

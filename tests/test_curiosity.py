@@ -135,7 +135,7 @@ def test_one_state_or_many(make, name):
         bonus = curiosity.bonus(episode)
         visits = np.zeros(curiosity.normaliser.mean.size)
         for t, state in enumerate(episode.observations[1:]):
-            found = curiosity.appraise(state[None], visits)
+            found = curiosity.of_states(state[None], visits)
             for part, whole in zip(found, bonus, strict=True):
                 assert part == pytest.approx(whole[[t]], rel=1e-4, abs=1e-6)
             visits += state if curiosity.discrete else 0

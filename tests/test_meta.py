@@ -8,7 +8,7 @@ import torch
 from shared import environment_of
 
 from mace_rl.base.rng import Streams
-from mace_rl.beta.controller import Effect
+from mace_rl.beta.controller import BetaGradient
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states
 from mace_rl.beta.meta import Evidence, MetaAdaptation
 from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
@@ -170,7 +170,7 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
         if len(sources) > 3:
             sources = [sources[k * len(sources) // 3] for k in range(3)]
         gradient = np.array([1.0, rng.standard_normal()], np.float32)
-        credit = controller.learn(gradient, 1.0, Effect(np.array([1, 0], np.float32), 1.0))
+        credit = controller.learn(gradient, 1.0, BetaGradient(np.array([1, 0], np.float32), 1.0))
         assert (credit is None) == (update == 0)
         output = np.mean([network.output(sequence) for sequence in sources])
         if waiting and credit is not None:
@@ -188,7 +188,7 @@ def test_without_a_part(make, settings):
     betas = []
     for _ in range(15):
         controller.next_episode(*invented(rng, 20))
-        effect = Effect(np.array([1, 0], np.float32), 1.0)
+        effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
         controller.learn(np.array([1, 0], np.float32), 1.0, effect)
         betas.append(controller.beta)
     if "reads" in settings:

@@ -45,7 +45,7 @@ def test_an_update_is_the_plain_formula(environment):
     [item] = rollout = trainer.collect()
     episode = item.episode
     actor, critic = copy.deepcopy((trainer.ppo.actor, trainer.ppo.critic))
-    trainer.improve(rollout)
+    trainer.ppo_update(rollout)
 
     returns = torch.zeros(len(episode))
     for t in range(len(episode)):
@@ -168,9 +168,9 @@ def test_plain_ppo_keeps_its_deviation_and_normalises_the_total_return(engine):
     trainer = Trainer(make(BOX, "mace_fixed", "plain", engine=engine))
     [item] = trainer.collect()
     assert abs(item.episode.actions).max() < 10
-    total = item.extrinsic_returns + item.beta * item.intrinsic_returns
+    total = item.extrinsic.returns + item.beta * item.intrinsic.returns
     assert total.mean() == pytest.approx(0) and total.std(ddof=1) == pytest.approx(1)
     before = trainer.ppo.policy.parameters.copy()
-    trainer.improve(Rollout([item]))
+    trainer.ppo_update(Rollout([item]))
     assert trainer.ppo.policy.log_std.tolist() == pytest.approx([np.log(0.6)])
     assert not np.array_equal(before, trainer.ppo.policy.parameters)

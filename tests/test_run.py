@@ -337,7 +337,7 @@ def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path
     for name in RESULTS:
         (tmp_path / name).unlink()
     (tmp_path / "agent.pt").write_text("stale")  # of a job that was killed while it wrote
-    monkeypatch.delattr(Trainer, "improve")
+    monkeypatch.delattr(Trainer, "ppo_update")
     run.run(config, tmp_path, keep_checkpoint=True)
     assert [(tmp_path / name).read_bytes() for name in OUTCOME] == before
     (interruption,) = provenance_of(tmp_path)["interruptions"]
@@ -364,7 +364,9 @@ CHANGES = [  # of a file, what is added, whether a training has other sources, a
 def test_what_an_edit_changes(tmp_path, name, added, training, everything, kernels):
 
     def copy():
-        spec = spec_from_file_location("of_a_copy", tmp_path / "mace_rl" / "base" / "code_digest.py")
+        spec = spec_from_file_location(
+            "of_a_copy", tmp_path / "mace_rl" / "base" / "code_digest.py"
+        )
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
         return module

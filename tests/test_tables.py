@@ -290,7 +290,7 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     titles = re.findall("(?m)^## (.*)", page)
     assert len(titles) == len(set(titles))
     assert re.findall("(?m)^### Part by part: (.*)", page) == [LITERAL, ROBUST]
-    assert f"{LITERAL}: 0 reproduced, 0 reversed, 10 not reproduced, 0 open" in page
+    assert f"{LITERAL}: 0 reproduced, 10 not reproduced, 0 cannot tell (too few seeds)" in page
     row = data["comparisons"].set_index(["env", "metric", "variant", "baseline"])
     row = row.loc["CartPole-v1", "area_under_curve", "mace_full", "ppo"]
     assert f"| {number(row['p_value'], 4)} | {number(row['p_holm'], 4)} |" in page
@@ -299,10 +299,12 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
         digits = digits_of(part)
         shown = (number(getattr(part, name), digits) for name in ("difference", "low", "high"))
         assert "{} ({} to {})".format(*shown) in page
-    assert "10 not reproduced, 0 open, 0 no room" in page and "docs/metrics.md" in page
+    assert "10 not reproduced, 0 cannot tell (too few seeds)" in page and "docs/metrics.md" in page
+    detailed = tables.parts(claims, ROBUST, {}).iloc[0]
     part = claims[0].ways[ROBUST].parts[0]
     ends = " to ".join(number(end) for end in (part.predicted_low, part.predicted_high))
-    assert f"| {number(part.room, 1)} | {ends} | {part.replication} | small | absent |" in page
+    assert detailed["room"].values[0].text == number(part.room, 1)
+    assert [*detailed.iloc[-4:]] == [ends, part.replication, "small", "absent"]
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
     alone = {name: make(runs.iloc[:10], QUICK) for name, make in kinds.items()}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}

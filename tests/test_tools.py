@@ -233,7 +233,7 @@ def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatc
     """One update an episode: four epochs of both networks, which see four numbers."""
     from mace_rl.training.trainer import Trainer
 
-    owners = ("improve_policy", "improve_values", "policy_gradients")
+    owners = ("update_policy", "update_critic", "policy_gradients")
     for owner, name in (
         *((bounds.compiled_learner, name) for name in owners),
         *((bounds.CompiledMLP, name) for name in ("forward", "outputs", "backward")),

@@ -31,13 +31,13 @@ SETTINGS = {
 
 
 def rollouts_of(trainer: Trainer, monkeypatch) -> list[list]:
-    rollouts, improve = [], trainer.improve
-    monkeypatch.setattr(trainer, "improve", lambda r: (rollouts.append(r), improve(r))[1])
+    rollouts, update = [], trainer.ppo_update
+    monkeypatch.setattr(trainer, "ppo_update", lambda r: (rollouts.append(r), update(r))[1])
     return rollouts
 
 
 def parts(item: Experience, name: str) -> tuple[np.ndarray, np.ndarray]:
-    return getattr(item, f"extrinsic_{name}"), getattr(item, f"intrinsic_{name}")
+    return getattr(item.extrinsic, name), getattr(item.intrinsic, name)
 
 
 def test_rollout_ends_with_the_episode_that_fills_it(run_config, register):
@@ -78,12 +78,12 @@ def test_each_reward_has_its_own_returns_and_critic(run_config, scaled):
             scale = trainer.ppo.reward_scales[kind].value if scaled else 1.0
             assert (abs(scale - 1) > 0.1) == scaled
             values = critics[kind](item.observations)[:, 0].detach().numpy()
-            found = getattr(item, f"{kind}_returns"), getattr(item, f"{kind}_advantages")
+            found = item.evaluations[kind].returns, item.evaluations[kind].advantages
             returns = ahead @ rewards
             np.testing.assert_allclose(found[0], returns / scale, rtol=1e-5)
             np.testing.assert_allclose(found[1], returns / scale - values, rtol=1e-4, atol=1e-5)
         remembered += returns.tolist()
-        trainer.improve(rollout)
+        trainer.ppo_update(rollout)
     memory = trainer.curiosity.memory
     np.testing.assert_allclose(memory.values[: len(memory), -1], remembered, rtol=1e-5)
     assert np.ptp(item.bonus.reward) > 0
@@ -136,20 +136,20 @@ def test_normaliser_of_the_update_is_that_of_acting(run_config):
     """New states change the normaliser after the update, never between acting and learning."""
     changes = {"episodes": 4, "ppo": {"normalise_observations": True}}
     trainer = Trainer(run_config("Pendulum-v1", "mace_full", 0, **changes))
-    improve, seen = Trainer.improve, []
+    ppo_update, seen = Trainer.ppo_update, []
 
-    def improve_watched(rollout):
+    def watched_update(rollout):
         (item,) = rollout
         outputs = trainer.ppo.policy.network.outputs(item.observations)
         log_probs = trainer.ppo.policy.log_probs(outputs, item.episode.actions)
         np.testing.assert_allclose(log_probs, item.episode.log_probs, atol=1e-4)
         seen.extend(item.episode.observations[:-1].astype(np.float64))
-        update = improve(trainer, rollout)
+        update = ppo_update(trainer, rollout)
         np.testing.assert_allclose(trainer.ppo.normaliser.mean, np.mean(seen, axis=0))
         np.testing.assert_allclose(trainer.ppo.normaliser.std, np.std(seen, axis=0))
         return update
 
-    trainer.improve = improve_watched
+    trainer.ppo_update = watched_update
     finish(trainer)
     assert len(seen) == 800
 
@@ -189,12 +189,12 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
         own, weighted = [], []
         for item in rollout:
             extrinsic, intrinsic = parts(item, "advantages")
-            own.extend(extrinsic / item.extrinsic_scale)
-            weighted.extend(item.beta * intrinsic / item.intrinsic_scale)
+            own.extend(extrinsic / item.extrinsic.scale)
+            weighted.extend(item.beta * intrinsic / item.intrinsic.scale)
         squares = np.square(own).sum(), np.square(weighted).sum()
         expected["bonus_share"] = squares[1] / sum(squares)
         for kind, critic in critics[number].items():
-            returns = np.concatenate([getattr(item, f"{kind}_returns") for item in rollout])
+            returns = np.concatenate([item.evaluations[kind].returns for item in rollout])
             errors = returns - critic(observations)[:, 0].detach().numpy()
             expected[f"explained_variance_{kind}"] = 1 - np.var(errors) / np.var(returns)
         if variant != "ppo":

@@ -17,6 +17,7 @@ from mace_rl.config.run import RunConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.library import settings
 from mace_rl.numerics.arrays import total
+from mace_rl.training.checks import CheckedBeta
 from mace_rl.training.trainer import Trainer
 from tools.meta.tasks import Generated
 
@@ -107,7 +108,7 @@ def constant(beta: float, gauge: Gauge) -> float:
 def begin(config: RunConfig, choose: Choice) -> Trainer:
     """A training whose β is chosen so."""
     trainer = Trainer(config)
-    trainer.controller = Chosen(config.episodes, choose)
+    trainer.controller = CheckedBeta(Chosen(config.episodes, choose))
     return trainer
 
 
@@ -120,7 +121,7 @@ def branches(number: int, seed: int, choose: Choice | None, count: int = 2) -> l
     found = []
     with threadpool_limits(1):
         for _ in trainer.run():
-            assert isinstance(trainer.controller, Chosen)
+            assert trainer.controller is not None
             gauge = trainer.controller.gauge
             if points and len(gauge.windows) >= points[0]:
                 points.pop(0)
@@ -137,8 +138,10 @@ def futures(config: RunConfig, trainer: Trainer) -> list[float]:
     for beta in GRID:
         future = begin(config, partial(constant, beta))
         future.load_state_dict(copy.deepcopy(state))
-        assert isinstance(future.controller, Chosen)
-        future.controller.now = beta
+        assert future.controller is not None
+        chosen = future.controller.part
+        assert isinstance(chosen, Chosen)
+        chosen.now = beta
         for _ in future.run():
             pass
         rest = sum(record.extrinsic_return for record in future.records[played:])

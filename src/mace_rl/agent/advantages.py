@@ -45,7 +45,7 @@ def episode_advantages(
     return generalised_advantages(rewards / unit, values, discount, gae_lambda)
 
 
-def paid_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
+def discounted_returns(rewards: np.ndarray, discount: float) -> np.ndarray:
     """The discounted return-to-go of each step as it was paid, [T].
 
     Without what a critic guesses for the rest, which early on differs by more than what is paid.

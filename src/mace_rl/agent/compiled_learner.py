@@ -54,13 +54,21 @@ class CompiledLearner(Stateful):
     ) -> Update:
         """As `Learner` says: each network goes through all epochs before the next one."""
         adam = {name: optimiser.state for name, optimiser in self.optimisers.items()}
-        config, sizes = self.config, self.network.sizes
-        loss = config.clip, config.entropy_coefficient, config.learn_log_std
-        norm, *change = improve_policy(batch, minibatches, sizes, *loss, adam["actor"])
-        norms, seen = {"actor": norm}, batch.observations
-        for kind, own in self.critics.items():
-            norms[kind] = improve_values(seen, returns[kind], minibatches, own.sizes, adam[kind])
-        return Update(norms, *change)
+        norm, approximate_kl, clip_fraction, entropy = update_policy(
+            batch,
+            minibatches,
+            self.network.sizes,
+            self.config.clip,
+            self.config.entropy_coefficient,
+            self.config.learn_log_std,
+            adam["actor"],
+        )
+        norms = {"actor": norm}
+        for kind, critic in self.critics.items():
+            norms[kind] = update_critic(
+                batch.observations, returns[kind], minibatches, critic.sizes, adam[kind]
+            )
+        return Update(norms, approximate_kl, clip_fraction, entropy)
 
     def policy_gradients(
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
@@ -77,7 +85,7 @@ class CompiledLearner(Stateful):
 
 
 @kernel
-def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_log_std, adam):
+def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_log_std, adam):
     """Descend the clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
 
     steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
@@ -85,7 +93,7 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
     Returns the fields of an `Update`, with this network's gradient norm alone.
     """
     parameters, count = adam.parameters, len(steps.advantages)
-    log_std = own_part(parameters, sizes)
+    log_std = log_std_part(parameters, sizes)
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradient, norm = np.empty_like(parameters), 0.0
     new_log_probs, entropies = np.empty(count, np.float32), np.empty(count)
@@ -94,29 +102,30 @@ def improve_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_l
         for end in minibatches.ends:
             back = transposed(parameters, sizes)
             gradient[:] = 0
-            own, share = own_part(gradient, sizes), -1 / (end - first)
+            own, share = log_std_part(gradient, sizes), -1 / (end - first)
             for start in range(first, end, BLOCK):
                 stop = min(start + BLOCK, end)
                 chosen, new = order[start:stop], new_log_probs[start:stop]
-                seen, done = taken(steps.observations, chosen), taken(steps.actions, chosen)
-                outputs = forward(seen, parameters, sizes, activations)[:, : sizes[-1]]
-                new[:] = log_probs(outputs, log_std, done)
+                observations = gather(steps.observations, chosen)
+                actions = gather(steps.actions, chosen)
+                outputs = forward(observations, parameters, sizes, activations)[:, : sizes[-1]]
+                new[:] = log_probs(outputs, log_std, actions)
                 weights = surrogate_weights(new, steps, chosen, clip, share)
                 grad, entropies[start:stop] = log_prob_gradient(
-                    outputs, log_std, done, weights, share * entropy_coefficient, own
+                    outputs, log_std, actions, weights, share * entropy_coefficient, own
                 )
-                backward(seen, activations, grad, back, sizes, gradient, scratch)
+                backward(observations, activations, grad, back, sizes, gradient, scratch)
             if not learn_log_std:
                 own[:] = 0
             norm = step(gradient, adam)
             first = end
-    old_log_probs = taken(steps.log_probs, minibatches.epochs[-1])
+    old_log_probs = gather(steps.log_probs, minibatches.epochs[-1])
     return norm, *policy_change(new_log_probs, old_log_probs, clip), mean(entropies)
 
 
 @kernel
-def improve_values(observations, returns, minibatches, sizes, adam):
-    """`improve_policy` for V(s), by the mean squared error against the λ-returns, float32 [N]."""
+def update_critic(observations, returns, minibatches, sizes, adam):
+    """`update_policy` for V(s), by the mean squared error against the λ-returns, float32 [N]."""
     parameters = adam.parameters
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradient, norm = np.empty_like(parameters), 0.0
@@ -127,12 +136,12 @@ def improve_values(observations, returns, minibatches, sizes, adam):
             gradient[:] = 0
             for start in range(first, end, BLOCK):
                 chosen = order[start : min(start + BLOCK, end)]
-                seen = taken(observations, chosen)
-                values = forward(seen, parameters, sizes, activations)
+                states = gather(observations, chosen)
+                values = forward(states, parameters, sizes, activations)
                 grad = np.zeros_like(values)
                 for n in range(len(chosen)):
                     grad[n, 0] = f32(2 / (end - first)) * (values[n, 0] - returns[chosen[n]])
-                backward(seen, activations, grad, back, sizes, gradient, scratch)
+                backward(states, activations, grad, back, sizes, gradient, scratch)
             norm = step(gradient, adam)
             first = end
     return norm
@@ -142,22 +151,22 @@ def improve_values(observations, returns, minibatches, sizes, adam):
 def policy_gradients(observations, actions, advantages, parameters, sizes):
     """∇_θ of the mean of log π(a|s) · A for each row of advantages, [K, N]; float32 [K, n]."""
     weights = (advantages / len(observations)).astype(np.float32)
-    log_std, back = own_part(parameters, sizes), transposed(parameters, sizes)
+    log_std, back = log_std_part(parameters, sizes), transposed(parameters, sizes)
     activations, scratch = activation_buffer(BLOCK, sizes), activation_buffer(BLOCK, sizes)
     gradients = np.zeros((len(weights), len(parameters)), np.float32)
     for start in range(0, len(observations), BLOCK):
         end = min(start + BLOCK, len(observations))
-        seen, done = observations[start:end], actions[start:end]
-        outputs = forward(seen, parameters, sizes, activations)[:, : sizes[-1]]
+        states, chosen = observations[start:end], actions[start:end]
+        outputs = forward(states, parameters, sizes, activations)[:, : sizes[-1]]
         for k in range(len(weights)):
-            own = own_part(gradients[k], sizes)
-            grad, _ = log_prob_gradient(outputs, log_std, done, weights[k, start:end], 0.0, own)
-            backward(seen, activations, grad, back, sizes, gradients[k], scratch)
+            own = log_std_part(gradients[k], sizes)
+            grad, _ = log_prob_gradient(outputs, log_std, chosen, weights[k, start:end], 0.0, own)
+            backward(states, activations, grad, back, sizes, gradients[k], scratch)
     return gradients
 
 
 @kernel
-def own_part(vector, sizes):
+def log_std_part(vector, sizes):
     """The part for log_std of a vector like a `Policy`'s parameters: what follows the network's."""
     count = 0
     for layer in range(len(sizes) - 1):
@@ -166,7 +175,7 @@ def own_part(vector, sizes):
 
 
 @kernel
-def taken(array, chosen):
+def gather(array, chosen):
     """The chosen rows, or elements, of an array, [N, …]."""
     result = np.empty((len(chosen), *array.shape[1:]), array.dtype)
     for n in range(len(chosen)):

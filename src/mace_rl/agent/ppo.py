@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,14 @@ from mace_rl.numerics.normaliser import Normalisation, RunningNormaliser
 
 TINY = 1e-8  # the smallest scale of a curiosity bonus
 OBSERVATION_CLIP = 10.0  # bound of normalised observations, in standard deviations
+
+
+class Evaluation(NamedTuple):
+    """What a critic makes of one kind of reward in an episode of T steps."""
+
+    advantages: np.ndarray  # float64 [T]
+    returns: np.ndarray  # λ-returns, float64 [T]
+    scale: float  # `PPO.advantage_scale`, by which the advantages are divided
 
 
 @dataclass(eq=False)
@@ -72,10 +81,10 @@ class PPO(ActorCritic, Stateful):
             kind: AdvantageScale(advantages.get(kind, TINY)) for kind in self.critics
         }
 
-    def advantages_and_returns(
+    def advantages(
         self, kind: str, observations: np.ndarray, rewards: np.ndarray, terminated: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Advantages and λ-returns of one episode for one kind of reward, float64 [T] each.
+    ) -> Evaluation:
+        """Advantages and λ-returns of one episode for one kind of reward.
 
         observations: normalised, [T + 1, observation]; rewards: [T], before scaling. The last state
         is worth 0 if it is terminal (with `bootstrap_at_time_limit` false always), else what the
@@ -84,12 +93,12 @@ class PPO(ActorCritic, Stateful):
         if self.config.scale_rewards:
             self.reward_scales[kind].update(rewards)
         ends = terminated or not self.config.bootstrap_at_time_limit
-        paid = rewards, self.reward_scale(kind), self.critics[kind].outputs(observations), ends
+        unit, values = self.reward_scale(kind), self.critics[kind].outputs(observations)
         discounts = self.config.discount, self.config.gae_lambda
-        advantages, returns = episode_advantages(*paid, *discounts)
+        advantages, returns = episode_advantages(rewards, unit, values, ends, *discounts)
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
-        return advantages, returns
+        return Evaluation(advantages, returns, self.advantage_scale(kind))
 
     def reward_scale(self, kind: str) -> float:
         """The divisor of one kind of rewards."""

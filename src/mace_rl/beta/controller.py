@@ -8,8 +8,8 @@ import numpy as np
 from mace_rl.environments.episode import Episode
 
 
-class Effect(NamedTuple):
-    """What a little more β in each episode of a rollout changes in the update on it."""
+class BetaGradient(NamedTuple):
+    """What a little more β in each episode of a rollout changes in the update on it: dθ'/dβ."""
 
     direction: np.ndarray  # dθ'/dβ as the optimiser steps, up to a factor, float32 [n]
     advantage_rms: float  # of what β weighs: the rollout's intrinsic advantages, in their scale
@@ -38,10 +38,12 @@ class BetaController(ABC):
         """After the last `next_episode` before an update of the policy, and before `learn`."""
         return  # most rules do not ask when the policy changes
 
-    def learn(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+    def learn(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> float | None:
         """After each rollout, before the policy's update on it: what its β does to the policy.
 
-        gradient: g_E, the policy gradient of the rollout's extrinsic return, [n]; strength: RMS of
+        gradient: g_E, the policy gradient of the rollout's extrinsic return, [n]; advantage_rms: of
         the extrinsic advantages in their scale. Returns the credit of the earlier β that has been
         judged with this, or None.
         """

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from mace_rl.base.state import Stateful
-from mace_rl.beta.controller import Effect
+from mace_rl.beta.controller import BetaGradient
 from mace_rl.config.beta import CreditConfig, PretrainedConfig
 from mace_rl.numerics.matmul import dot
 
@@ -29,43 +29,45 @@ class Judge(Stateful):
     bonus weighs nothing, there is no signal.
     """
 
-    STATE = ("directions", "strengths", "credits", "alignments", "alignment_weight")
+    STATE = ("directions", "bonus_weights", "credits", "alignments", "alignment_weight")
 
     def __init__(self, config: CreditConfig) -> None:
         self.horizon, self.bound = config.horizon, config.max_credit
         # Of each β that is being judged, the oldest first:
         self.directions: list[np.ndarray] = []  # what it changes in the policy, of length 1, or 0
-        self.strengths: list[float] = []  # of the bonus in that update, at most 1
+        self.bonus_weights: list[float] = []  # of the bonus in that update, at most 1
         self.credits: list[float] = []
         self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 
-    def judge(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+    def judge(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> float | None:
         """The credit of the β that has now been judged to the end; arguments as in `learn`."""
-        self.credit_all(gradient, strength)
-        done = len(self.credits) == self.horizon
-        credit = self.bounded(self.credits[0]) if done else None
-        length = math.sqrt(dot(effect.direction, effect.direction))
-        direction = effect.direction / np.float32(length) if length > 0 else effect.direction
-        self.directions = [*self.directions[done:], direction]
-        self.strengths = [*self.strengths[done:], min(1.0, effect.advantage_rms)]
-        self.credits = [*self.credits[done:], 0.0]
+        self.credit_all(gradient, advantage_rms)
+        judged = len(self.credits) == self.horizon
+        credit = self.bounded(self.credits[0]) if judged else None
+        length = math.sqrt(dot(change.direction, change.direction))
+        direction = change.direction / np.float32(length) if length > 0 else change.direction
+        self.directions = [*self.directions[judged:], direction]
+        self.bonus_weights = [*self.bonus_weights[judged:], min(1.0, change.advantage_rms)]
+        self.credits = [*self.credits[judged:], 0.0]
         return credit
 
-    def credit_all(self, gradient: np.ndarray, strength: float) -> None:
+    def credit_all(self, gradient: np.ndarray, advantage_rms: float) -> None:
         """Add one term to the credit of every β under judgement, in units of its usual size.
 
         That is a running root mean square, in which each update counts as one.
         """
-        if not (self.credits and strength > 0):
+        if not (self.credits and advantage_rms > 0):
             return
-        along = [dot(gradient, direction) / strength for direction in self.directions]
+        along = [dot(gradient, direction) / advantage_rms for direction in self.directions]
         squares = sum(value * value for value in along) / len(along)
         self.alignments = SCALE_DECAY * self.alignments + squares
         self.alignment_weight = SCALE_DECAY * self.alignment_weight + 1
-        usual = math.sqrt(self.alignments / self.alignment_weight)
-        if usual > 0:
-            terms = zip(along, self.strengths, strict=True)
-            added = [value / usual * min(1.0, strength) * own for value, own in terms]
+        rms = math.sqrt(self.alignments / self.alignment_weight)
+        if rms > 0:
+            terms = zip(along, self.bonus_weights, strict=True)
+            added = [value / rms * min(1.0, advantage_rms) * own for value, own in terms]
             self.credits = [a + b for a, b in zip(self.credits, added, strict=True)]
 
     def bounded(self, credit: float) -> float:

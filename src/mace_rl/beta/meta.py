@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 
 from mace_rl.base.state import Stateful
-from mace_rl.beta.controller import BetaController, Effect
+from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Judge
 from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork, TorchMetaNetwork
 from mace_rl.beta.squash import beta_of, logit, natural_log
@@ -96,9 +96,11 @@ class MetaAdaptation(Stateful, BetaController):
         found[:, :seen] /= np.float32(math.sqrt(seen))  # so that many weigh no more than few
         return found
 
-    def learn(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+    def learn(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> float | None:
         """See `BetaController`."""
-        credit = self.judge.judge(gradient, strength, effect)
+        credit = self.judge.judge(gradient, advantage_rms, change)
         several = len(self.sources) > self.config.sequences
         chosen = self.sources
         if several:

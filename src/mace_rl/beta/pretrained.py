@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mace_rl.base.state import Stateful
-from mace_rl.beta.controller import BetaController, Effect
+from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator, Judge
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit, read_network
@@ -45,9 +45,11 @@ class PretrainedAdaptation(Stateful, BetaController):
         if closed and self.network is not None:
             self.lstm_part = float(lstm_logit(self.gauge.sequence(), self.network))
 
-    def learn(self, gradient: np.ndarray, strength: float, effect: Effect) -> float | None:
+    def learn(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> float | None:
         """See `BetaController`."""
-        credit = self.judge.judge(gradient, strength, effect)
+        credit = self.judge.judge(gradient, advantage_rms, change)
         if credit is not None:
             self.integrator.add(credit, self.gauge.progress)
         return credit

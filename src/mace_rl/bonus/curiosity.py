@@ -73,9 +73,9 @@ class Curiosity(Stateful, IntrinsicReward):
 
     def bonus(self, episode: Episode) -> Bonus:
         """R_curiosity of each step: novelty × relevance of the state it led to."""
-        return self.appraise(episode.observations[1:])
+        return self.of_states(episode.observations[1:])
 
-    def appraise(self, states: np.ndarray, visits: np.ndarray | None = None) -> Bonus:
+    def of_states(self, states: np.ndarray, visits: np.ndarray | None = None) -> Bonus:
         """The bonus for states that an episode came to one after the other.
 
         states: float32 [N, observation]; visits: see `Novelty.continued`, if it goes on.

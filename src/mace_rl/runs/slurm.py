@@ -1,7 +1,7 @@
 """How long a run may take on a slow machine, and how many runs share an entry of a cluster's queue.
 
-The estimate is a few times the usual time (docs/scaling.md). A run that is ended for exceeding it
-resumes, with twice the time.
+The estimate is a few times the usual time (docs/performance.md). A run that is ended for exceeding
+it resumes, with twice the time.
 """
 
 import math

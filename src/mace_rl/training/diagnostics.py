@@ -1,7 +1,6 @@
-"""The diagnostics of an update, and a warning about observations that cannot be learned from."""
+"""The diagnostics of an update."""
 
 import math
-from operator import attrgetter
 
 import numpy as np
 
@@ -9,37 +8,16 @@ from mace_rl.agent.learner import Update
 from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.matmul import dot
-from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.training.experience import Rollout
 from mace_rl.training.records import UpdateRecord
 
 
-def unseen(normaliser: RunningNormaliser) -> list[int]:
-    """The dimensions of observations whose differences are lost: tiny, or a few units of float32.
-
-    A dimension that varies only by float64's rounding is constant: suspect if it is large.
-    """
-    size = abs(normaliser.mean)
-    deviation = np.sqrt(normaliser.sum_of_squares / normaliser.count)
-    varies = deviation > 1e-12 * size
-    few_units = deviation < size * 2.0**-22
-    tiny = varies & ~few_units & (deviation <= 1e-8)
-    offset = few_units & (size > np.where(varies, 1e3, 2.0**24))
-    return np.flatnonzero(tiny | offset).tolist()
-
-
-ADVANTAGES = {
-    "extrinsic": attrgetter("extrinsic_advantages"),
-    "intrinsic": attrgetter("intrinsic_advantages"),
-}
-
-
 def diagnose(
-    done: tuple[int, int, int], rollout: Rollout, update: Update, credit: float | None
+    count: tuple[int, int, int], rollout: Rollout, update: Update, credit: float | None
 ) -> UpdateRecord:
     """The row of `diagnostics.csv` of one update.
 
-    done: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
+    count: updates, episodes and environment steps so far; credit: of earlier βs, None without one.
     """
 
     def mean_of(part: str) -> float:
@@ -48,12 +26,12 @@ def diagnose(
         return mean(rollout.joined(lambda item: getattr(item.bonus, part)))
 
     extrinsic_variance, intrinsic_variance = (
-        explained_variance(rollout.joined(advantages), rollout.returns(kind))
-        for kind, advantages in ADVANTAGES.items()
+        explained_variance(rollout.advantages_of(kind), rollout.returns(kind))
+        for kind in ("extrinsic", "intrinsic")
     )
-    own, _, added, _ = rollout.advantages
-    extrinsic, weighted = dot(own, own), dot(added, added)
-    number, episode, env_steps = done
+    advantages, _, share, _ = rollout.advantages
+    extrinsic, weighted = dot(advantages, advantages), dot(share, share)
+    number, episode, env_steps = count
     return UpdateRecord(
         update=number,
         episode=episode,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mace_rl.agent.ppo import Evaluation
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import mean, variance
@@ -16,30 +17,36 @@ from mace_rl.numerics.compiling import kernel
 
 @dataclass(frozen=True)
 class Experience:
-    """An episode with all that the update needs; arrays are [T]."""
+    """An episode of T steps with all that the update needs."""
 
     episode: Episode
     observations: np.ndarray  # float32 [T, observation], normalised as the networks see them
     beta: float
     bonus: Bonus | None  # None in plain PPO
-    extrinsic_advantages: np.ndarray
-    extrinsic_returns: np.ndarray
-    intrinsic_advantages: np.ndarray  # zeros without a bonus, like the next
-    intrinsic_returns: np.ndarray
-    extrinsic_scale: float  # `PPO.advantage_scale`, by which the advantages are divided
-    intrinsic_scale: float
+    extrinsic: Evaluation
+    intrinsic: Evaluation  # `without_bonus`, zeros
+
+    @property
+    def evaluations(self) -> dict[str, Evaluation]:
+        """Of both rewards."""
+        return {"extrinsic": self.extrinsic, "intrinsic": self.intrinsic}
 
     def with_normalised_returns(self) -> "Experience":
         """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
-        old = {k: getattr(self, f"{k}_returns") for k in ("extrinsic", "intrinsic")}
-        returns = old["extrinsic"] + self.beta * old["intrinsic"]
+        returns = self.extrinsic.returns + self.beta * self.intrinsic.returns
         unit = math.sqrt(variance(returns) * len(returns) / max(len(returns) - 1, 1)) + 1e-7
-        new = {f"{k}_returns": (part - mean(part)) / unit for k, part in old.items()}
-        new |= {
-            f"{k}_advantages": getattr(self, f"{k}_advantages") + new[f"{k}_returns"] - part
-            for k, part in old.items()
-        }
-        return replace(self, **new)
+
+        def in_units(of: Evaluation) -> Evaluation:
+            new = (of.returns - mean(of.returns)) / unit
+            return of._replace(advantages=of.advantages + new - of.returns, returns=new)
+
+        extrinsic, intrinsic = in_units(self.extrinsic), in_units(self.intrinsic)
+        return replace(self, extrinsic=extrinsic, intrinsic=intrinsic)
+
+
+def without_bonus(steps: int) -> Evaluation:
+    """That of a reward which is always 0."""
+    return Evaluation(np.zeros(steps), np.zeros(steps), 1.0)
 
 
 class Advantages(NamedTuple):
@@ -47,7 +54,7 @@ class Advantages(NamedTuple):
 
     extrinsic: np.ndarray  # A_E, in units of its scale
     intrinsic: np.ndarray  # A_I, alike
-    share: np.ndarray  # β A_I
+    weighted: np.ndarray  # β A_I
     total: np.ndarray  # A_E + β A_I, the advantage of the total reward
 
 
@@ -63,10 +70,10 @@ class Rollout(list[Experience]):
         """Those of all steps."""
         weighed = [
             weigh(
-                item.extrinsic_advantages,
-                item.intrinsic_advantages,
-                item.extrinsic_scale,
-                item.intrinsic_scale,
+                item.extrinsic.advantages,
+                item.intrinsic.advantages,
+                item.extrinsic.scale,
+                item.intrinsic.scale,
                 item.beta,
             )
             for item in self
@@ -90,16 +97,18 @@ class Rollout(list[Experience]):
         """Float32 [N], when the actions were taken."""
         return self.joined(lambda item: item.episode.log_probs)
 
+    def advantages_of(self, kind: str) -> np.ndarray:
+        """Of the "extrinsic" or "intrinsic" reward, before scaling, float64 [N]."""
+        return self.joined(lambda item: item.evaluations[kind].advantages)
+
     def returns(self, kind: str) -> np.ndarray:
         """The λ-returns of the "extrinsic" or "intrinsic" reward, float64 [N]."""
-        if kind == "extrinsic":
-            return self.joined(lambda item: item.extrinsic_returns)
-        return self.joined(lambda item: item.intrinsic_returns)
+        return self.joined(lambda item: item.evaluations[kind].returns)
 
 
 @kernel
 def weigh(extrinsic, intrinsic, extrinsic_scale, intrinsic_scale, beta):
     """`Advantages` of an episode, from both kinds before scaling, float64 [T] each."""
-    own, added = extrinsic / extrinsic_scale, intrinsic / intrinsic_scale
-    share = beta * added
-    return own, added, share, own + share
+    extrinsic, intrinsic = extrinsic / extrinsic_scale, intrinsic / intrinsic_scale
+    weighted = beta * intrinsic
+    return extrinsic, intrinsic, weighted, extrinsic + weighted

@@ -36,15 +36,23 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
 from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.training.checks import CheckedBeta, CheckedBonus
 
 
 def beta_controller(
     config: RunConfig, environment: Environment, streams: Streams
-) -> BetaController | None:
+) -> CheckedBeta | None:
     """What sets β in this variant; None for plain PPO."""
+    if isinstance(config.beta, NoBonus):
+        return None
+    return CheckedBeta(unchecked_controller(config, environment, streams))
+
+
+def unchecked_controller(
+    config: RunConfig, environment: Environment, streams: Streams
+) -> BetaController:
+    """The same as it is."""
     match config.beta:
-        case NoBonus():
-            return None
         case MetaBeta(initial=initial):
             assert config.meta is not None  # `RunConfig` checked that
             own = environment, config.engine, streams["meta"]
@@ -52,8 +60,10 @@ def beta_controller(
         case PretrainedBeta(initial=initial):
             assert config.pretrained is not None
             return PretrainedAdaptation(config.pretrained, initial, config.episodes)
-        case rule:
+        case ConstantBeta() | ExponentialBeta() | CustomBeta() as rule:
             return beta_rule(rule, streams["beta"])
+        case NoBonus():
+            raise ValueError("without a bonus there is no β")
 
 
 def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
@@ -69,7 +79,7 @@ def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaControl
 
 def intrinsic_reward(
     config: RunConfig, environment: Environment, streams: Streams
-) -> IntrinsicReward | None:
+) -> CheckedBonus | None:
     """The bonus that β weighs: curiosity, or a user's own; None in plain PPO."""
     match config.bonus:
         case None:
@@ -77,10 +87,11 @@ def intrinsic_reward(
         case CuriosityBonus():
             assert config.novelty is not None
             space, size = environment.observation_space, environment.observation_size
-            return Curiosity(config.memory, config.novelty, space, size, streams)
+            return CheckedBonus(Curiosity(config.memory, config.novelty, space, size, streams))
         case CustomBonus(estimator=estimator, arguments=arguments):
             key, own = "bonus.estimator", (environment, streams["bonus"])
-            return make(estimator, key, IntrinsicReward, False, *own, **arguments)
+            made = make(estimator, key, IntrinsicReward, False, *own, **arguments)
+            return CheckedBonus(made)
 
 
 def environment(config: AgentConfig, streams: Streams) -> Environment:

@@ -20,10 +20,10 @@ import torch
 from gymnasium.spaces import Discrete
 from torch import Tensor, from_numpy, nn
 
-from mace_rl.agent.advantages import paid_returns
+from mace_rl.agent.advantages import discounted_returns
 from mace_rl.agent.learner import Update
 from mace_rl.agent.policy import Policy
-from mace_rl.agent.ppo import ActorCritic
+from mace_rl.agent.ppo import ActorCritic, Evaluation
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.base.rng import Streams
@@ -38,7 +38,7 @@ from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.training.experience import Experience, Rollout
+from mace_rl.training.experience import Experience, Rollout, without_bonus
 from mace_rl.training.rollout import roll_out
 from mace_rl.training.trainer import Trainer
 
@@ -296,32 +296,33 @@ class PublishedTrainer(Trainer):
         reaches = self.settings.beta_reaches_reward and done
         return self.controller.printed if reaches else rule.initial
 
-    def appraise(self, episode: Episode) -> Experience:
+    def advantages(self, episode: Episode) -> Experience:
         """The returns of the total reward; what is returned has the β that the network printed."""
-        bonus, beta, printed, weighed = None, 0.0, 0.0, np.zeros(len(episode))
+        bonus, beta, printed, reward = None, 0.0, 0.0, np.zeros(len(episode))
         if self.curiosity is not None:
             bonus, beta = self.curiosity.bonus(episode), self._beta()
-            printed, weighed = beta, bonus.reward
+            printed, reward = beta, bonus.reward
             if self.config.beta.kind == "meta":
-                self.controller.read(episode, weighed * self.settings.meta_sees_bonus)
+                self.controller.read(episode, reward * self.settings.meta_sees_bonus)
                 printed = self.controller.printed
-        self._record(episode, weighed, beta)
-        returns = paid_returns(episode.rewards + beta * weighed, self.config.ppo.discount)
-        states, none = episode.observations, np.zeros(len(episode))
-        unknown = np.nan  # how the two rewards share in what one critic learns
-        given = episode, states[:-1], printed, bonus, returns, returns, none, none
-        return Experience(*given, extrinsic_scale=1.0, intrinsic_scale=unknown)
+        self.record(episode, bonus, beta)
+        returns = discounted_returns(episode.rewards + beta * reward, self.config.ppo.discount)
+        both = Evaluation(returns, returns, 1.0)
+        # How the two rewards share in what one critic learns is unknown.
+        none = without_bonus(len(episode))._replace(scale=np.nan)
+        return Experience(episode, episode.observations[:-1], printed, bonus, both, none)
 
-    def adapt(self, rollout: Rollout) -> None:
+    def meta_update(self, rollout: Rollout) -> None:
         """The meta network's loss is a number on its own: nothing is learned."""
 
-    def improve(self, rollout: Rollout) -> Update:
+    def ppo_update(self, rollout: Rollout) -> Update:
         """PPO on the total reward of one episode."""
         [item] = rollout
-        returns = item.extrinsic_returns.astype(np.float32)
+        returns = item.extrinsic.returns.astype(np.float32)
         with drawing_from(self.ppo.draws):
             update, values = self.ppo.update(item.episode, returns)
         for name, network in (("actor", self.ppo.policy), *self.ppo.critics.items()):
             require_finite(f"a weight of the {name}", network.parameters)
-        rollout[0] = replace(item, extrinsic_advantages=item.extrinsic_returns - values)
+        evaluation = item.extrinsic._replace(advantages=item.extrinsic.returns - values)
+        rollout[0] = replace(item, extrinsic=evaluation)
         return update

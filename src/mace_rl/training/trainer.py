@@ -2,44 +2,41 @@
 
     R_total = R_extrinsic + β · R_curiosity                                            (paper)
 
-One `Trainer` is one run. Each round plays whole episodes with the current policy, weighs the
-curiosity bonus of each episode with its β, updates the policy by PPO, and lets the episodes become
-memory. The phases are methods: `collect`, `appraise`, `adapt`, `improve`. What they use is in the
-rooms `agent` (PPO), `bonus` (novelty, episodic memory), `beta` (schedules, meta network) and
-`environments`; `factories` makes it as the settings ask for.
+One `Trainer` is one run. Each round plays whole episodes with the current policy, finds the
+advantages of each episode's reward and of its curiosity bonus, and lets it become memory
+(`collect`, `advantages`). Then what sets β learns (`meta_update`), and PPO updates the policy with
+both advantages, weighed by β (`ppo_update`). What they use is in the folders `agent` (PPO), `bonus`
+(novelty, episodic memory), `beta` (schedules, meta network) and `environments`; `factories` makes
+it as the settings ask for. `experience` has the place where β meets the advantage.
 """
 
-import logging
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
 
-from mace_rl.agent.advantages import normalised, normalised_change, paid_returns
+from mace_rl.agent.advantages import discounted_returns, normalised, normalised_change
 from mace_rl.agent.learner import Batch, Update
-from mace_rl.base.errors import Refusal
+from mace_rl.agent.policy import ActingPolicy
 from mace_rl.base.rng import Streams
-from mace_rl.beta.controller import Effect
-from mace_rl.config.beta import LARGEST_BETA
+from mace_rl.beta.controller import BetaGradient
+from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import mean, root_mean_square, total
-from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
 from mace_rl.training import resuming
-from mace_rl.training.diagnostics import diagnose, unseen
-from mace_rl.training.experience import Experience, Rollout
-from mace_rl.training.factories import beta_controller, environment, intrinsic_reward, ppo
-from mace_rl.training.records import (
-    EpisodeRecord,
-    UpdateRecord,
-    as_columns,
-    as_rows,
-    rounded,
+from mace_rl.training.checks import (
+    Located,
+    require_learned,
+    warn_of_observations,
+    warn_of_rewards,
 )
+from mace_rl.training.diagnostics import diagnose
+from mace_rl.training.experience import Experience, Rollout, without_bonus
+from mace_rl.training.factories import beta_controller, environment, intrinsic_reward, ppo
+from mace_rl.training.records import EpisodeRecord, UpdateRecord, as_columns, as_rows, rounded
 from mace_rl.training.rollout import draw_noise, rollout_for
-
-logger = logging.getLogger(__name__)
 
 
 class Trainer:
@@ -68,89 +65,53 @@ class Trainer:
         """
         while len(self.records) < self.config.episodes:
             start = len(self.records)
-            updating = False
-            try:
-                rollout = self.collect()
-                updating = True
-                credit = self.adapt(rollout)
-                update = self.improve(rollout)
-                done = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
-                self.diagnostics.append(diagnose(done, rollout, update, credit))
-            except (Exception, SystemExit, GeneratorExit) as error:
-                run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
-                played = len(self.records)
-                where = (
-                    f"the update after episode {played}" if updating else f"episode {played + 1}"
-                )
-                if isinstance(error, Refusal):
-                    raise type(error)(f"{run}, {where}: {error}") from error.__cause__
-                if not isinstance(error, Exception):
-                    raise Refusal(f"{run}, {where}: code raised {error!r}") from error
-                error.add_note(f"in {run}, {where}")
-                raise
+            rollout = self.collect()
+            with Located(self.config, f"the update after episode {len(self.records)}"):
+                credit = self.meta_update(rollout)
+                update = self.ppo_update(rollout)
+                count = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
+                self.diagnostics.append(diagnose(count, rollout, update, credit))
             yield self.records[start:]
 
     def collect(self) -> Rollout:
         """Play episodes with the current policy until a rollout is full."""
-        policy = self.ppo.acting_policy()
-        rollout = Rollout()
-        collected = 0
-        wanted = self.config.ppo.rollout_steps
-        while collected < wanted and len(self.records) < self.config.episodes:
-            noise = draw_noise(self.environment, self.noise)
-            self.last_episodes.begin(self.environment)
-            episode = self.play(self.environment, policy, noise)
-            self.last_episodes.end(episode)
-            item = self.appraise(episode)
-            own_units = self.config.ppo.normalise_returns
-            rollout.append(item.with_normalised_returns() if own_units else item)
-            collected += len(episode)
+        policy, rollout, steps = self.ppo.acting_policy(), Rollout(), 0
+        while steps < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes:
+            with Located(self.config, f"episode {len(self.records) + 1}"):
+                episode = self.play_episode(policy)
+                rollout.append(self.advantages(episode))
+                steps += len(episode)
         return rollout
 
-    def appraise(self, episode: Episode) -> Experience:
-        """Curiosity bonus, advantages and β of a finished episode, which then becomes memory."""
+    def play_episode(self, policy: ActingPolicy) -> Episode:
+        """One, with random numbers that are drawn beforehand."""
+        noise = draw_noise(self.environment, self.noise)
+        self.last_episodes.begin(self.environment)
+        episode = self.play(self.environment, policy, noise)
+        self.last_episodes.end(episode)
+        return episode
+
+    def advantages(self, episode: Episode) -> Experience:
+        """Bonus, β and the advantages of both rewards; then the episode becomes memory."""
         observations = self.ppo.normalise(episode.observations)
         unit = self.ppo.unit("extrinsic")
-        extrinsic_advantages, extrinsic_returns = self.ppo.advantages_and_returns(
-            "extrinsic", observations, episode.rewards, episode.terminated
-        )
-        if self.records and self.ppo.unit("extrinsic") > 1e6 * unit:
-            logger.warning(
-                "%s: the rewards of episode %d are so large that others now count for a millionth",
-                *(self.config.environment, len(self.records) + 1),
-            )
-        beta, bonus, intrinsic_scale = 0.0, None, 1.0
-        reward = intrinsic_advantages = intrinsic_returns = np.zeros(len(episode))
+        rewards = episode.rewards, episode.terminated
+        extrinsic = self.ppo.advantages("extrinsic", observations, *rewards)
+        warn_of_rewards(self.config, unit, self.ppo.unit("extrinsic"), len(self.records) + 1)
+        beta, bonus, intrinsic = 0.0, None, without_bonus(len(episode))
         if self.curiosity is not None and self.controller is not None:
-            beta = float(numbers("β", self.controller.beta, ()))
-            require_within("β", beta, largest=LARGEST_BETA)
-            bonus = self.curiosity.bonus(episode)
-            reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
-            largest = min(self.curiosity.largest, TOO_LARGE)
-            require_within("the curiosity bonus", reward, 1e-6, largest)
-            reward = np.maximum(reward, 0.0)
-            intrinsic_advantages, intrinsic_returns = self.ppo.advantages_and_returns(
-                "intrinsic", observations, reward, episode.terminated
-            )
-            intrinsic_scale = self.ppo.advantage_scale("intrinsic")
-            paid = paid_returns(episode.rewards, self.config.ppo.discount)
-            self.curiosity.remember(episode, paid)
-            self.controller.next_episode(episode, reward)
-        self._record(episode, reward, beta)
-        return Experience(
-            episode=episode,
-            observations=observations[:-1],
-            beta=beta,
-            bonus=bonus,
-            extrinsic_advantages=extrinsic_advantages,
-            extrinsic_returns=extrinsic_returns,
-            intrinsic_advantages=intrinsic_advantages,
-            intrinsic_returns=intrinsic_returns,
-            extrinsic_scale=self.ppo.advantage_scale("extrinsic"),
-            intrinsic_scale=intrinsic_scale,
-        )
+            beta, bonus = self.controller.beta, self.curiosity.bonus(episode)
+            rewards = bonus.reward, episode.terminated
+            intrinsic = self.ppo.advantages("intrinsic", observations, *rewards)
+            returns = discounted_returns(episode.rewards, self.config.ppo.discount)
+            self.curiosity.remember(episode, returns)
+            self.controller.next_episode(episode, bonus.reward)
+        self.record(episode, bonus, beta)
+        item = Experience(episode, observations[:-1], beta, bonus, extrinsic, intrinsic)
+        return item.with_normalised_returns() if self.config.ppo.normalise_returns else item
 
-    def _record(self, episode: Episode, bonus: np.ndarray, beta: float) -> None:
+    def record(self, episode: Episode, bonus: Bonus | None, beta: float) -> None:
+        """Its row of `episodes.csv`."""
         before = self.records[-1].env_steps if self.records else 0
         self.records.append(
             EpisodeRecord(
@@ -158,14 +119,14 @@ class Trainer:
                 env_steps=before + len(episode),
                 length=len(episode),
                 extrinsic_return=total(episode.rewards),
-                intrinsic_return=rounded(total(bonus)),
+                intrinsic_return=rounded(total(bonus.reward)) if bonus else 0.0,
                 beta=rounded(beta),
                 terminated=int(episode.terminated),
             )
         )
 
-    def adapt(self, rollout: Rollout) -> float | None:
-        """Meta-adaptation: tell the controller what β changes in the update, before it.
+    def meta_update(self, rollout: Rollout) -> float | None:
+        """Tell what sets β what β changes in the policy's update, before it.
 
         The update steps along the policy gradient g of the normalised total advantage, as Adam
         preconditions it. Shown are dg/dβ, preconditioned alike, and g_E, that of the extrinsic
@@ -181,30 +142,22 @@ class Trainer:
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
         change = normalised_change(weighed, intrinsic, centred)
-        acted = rollout.observations, rollout.actions
-        gradient, change = learner.policy_gradients(*acted, [extrinsic, change])
-        effect = Effect(learner.preconditioned(change), root_mean_square(intrinsic))
-        return self.controller.learn(gradient, root_mean_square(extrinsic), effect)
+        steps = rollout.observations, rollout.actions
+        gradient, change = learner.policy_gradients(*steps, [extrinsic, change])
+        of_beta = BetaGradient(learner.preconditioned(change), root_mean_square(intrinsic))
+        return self.controller.learn(gradient, root_mean_square(extrinsic), of_beta)
 
-    def improve(self, rollout: Rollout) -> Update:
+    def ppo_update(self, rollout: Rollout) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
-        returns = {kind: rollout.returns(kind) for kind in self.ppo.critics}
         advantages = normalised(rollout.advantages.total, self.config.ppo.centre_advantages)
-        acted = rollout.observations, rollout.actions, rollout.log_probs
-        update = self.ppo.update(Batch(*acted, advantages.astype(np.float32)), returns)
-        for name, norm in update.gradient_norms.items():
-            require_finite(f"the {name}'s gradient norm", norm)
-        # What went bad in an earlier epoch is in the weights, and may be hidden by a tanh.
-        for name, parameters in self.ppo.learner.parameters.items():
-            require_finite(f"a weight of the {name}", parameters)
+        steps = rollout.observations, rollout.actions, rollout.log_probs
+        batch = Batch(*steps, advantages.astype(np.float32))
+        update = self.ppo.update(batch, {kind: rollout.returns(kind) for kind in self.ppo.critics})
+        require_learned(update, self.ppo.learner)
         for item in rollout:
             self.ppo.normaliser.update(item.episode.observations[:-1])
-        if not self.diagnostics and (dimensions := unseen(self.ppo.normaliser)):
-            logger.warning(
-                "%s: differences in observation%s are below 1e-8, or below what float32 tells "
-                "apart, and are not learned from: use a smaller unit, or leave an offset out",
-                *(self.config.environment, dimensions),
-            )
+        if not self.diagnostics:
+            warn_of_observations(self.config, self.ppo.normaliser)
         return update
 
     def state_dict(self) -> dict[str, Any]:

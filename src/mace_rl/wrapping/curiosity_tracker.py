@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 
-from mace_rl.agent.advantages import paid_returns
+from mace_rl.agent.advantages import discounted_returns
 from mace_rl.agent.ppo import TINY
 from mace_rl.agent.scale import RewardScale
 from mace_rl.base.rng import Streams
@@ -96,7 +96,7 @@ class CuriosityTracker(Stateful):
         visits = np.zeros(len(first))
         self.recordings[environment] = Recording(beta, self.unit, usual, visits, [first])
 
-    def taken(self, action: Any) -> Any:
+    def as_recorded(self, action: Any) -> Any:
         """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
         space = self.spaces.action_space
         if isinstance(space, Discrete):
@@ -108,7 +108,7 @@ class CuriosityTracker(Stateful):
     ) -> dict[str, float]:
         """`PARTS` of the reward for a step, from its extrinsic reward and next observation.
 
-        action: from `taken`, before the step, since an environment may write into the one it gets.
+        action: from `as_recorded`, before the step, since an environment may write into its own.
         """
         recording = self.recordings[environment]
         if recording is None:
@@ -116,7 +116,7 @@ class CuriosityTracker(Stateful):
         step = len(recording.rewards) + 1
         reward = self.spaces.paid(reward, step)
         state = np.array(self.spaces.encode(observation, step))  # a copy
-        found = self.curiosity.appraise(state[None], recording.visits)
+        found = self.curiosity.of_states(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
         if not 0 <= bonus <= 1:
             require_within("the curiosity bonus", bonus, rounding=1e-6)
@@ -140,7 +140,7 @@ class CuriosityTracker(Stateful):
         self.scales["extrinsic"].update(episode.rewards)
         self.scales["curiosity"].update(bonus)
         self.paid, self.count = self.paid + total(bonus), self.count + len(episode)
-        self.curiosity.remember(episode, paid_returns(episode.rewards, self.config.discount))
+        self.curiosity.remember(episode, discounted_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
         if self.steps >= self.config.rollout_steps:

@@ -115,7 +115,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
-        taken = self.tracker.taken(action)
+        taken = self.tracker.as_recorded(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         parts = self.tracker.reward_parts(0, taken, reward, observation)
         if terminated or truncated:
@@ -146,7 +146,7 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """The environments' step, with other rewards, float64, and more in `infos`."""
-        taken = [self.tracker.taken(action) for action in actions]
+        taken = [self.tracker.as_recorded(action) for action in actions]
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
         reached = observations

@@ -9,7 +9,6 @@ import pandas as pd
 from mace_rl.training.records import read_table
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
 from mace_study.compare.comparisons import ALL
-from mace_study.compare.estimates import POWER
 from mace_study.compare.ledger import Answer, read_ledger
 from mace_study.compare.summary import from_to
 from mace_study.config.metrics import MetricsConfig
@@ -20,13 +19,9 @@ from mace_study.show import tables
 TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
 RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
 PARTS = (
-    "Differences count in the claim's favour, and so does *paper*, the same in its Table 1."
-    " *p*: of no difference; *p within*: of one beyond the margin; both corrected for all"
-    " parts. *P*: that a run of the first is better. *Margin*: what is worth mentioning."
-    f" *Detectable*: the smallest that these seeds show with a power of {POWER:.0%}, before"
-    " correction."
-    " *Room*: how much better than the second any run could be, or is. *One seed*: where our"
-    " difference would lie if the paper's, of one run each, differed from it by chance."
+    "Differences count in the claim's favour, with their intervals. *p*: of no difference,"
+    " corrected for all parts. claims.json has each part's margin, room, smallest detectable"
+    " difference, p of equivalence, and the paper's own difference."
 )
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
@@ -66,7 +61,7 @@ def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
     """How many claims of one family have which verdict, in words."""
     counts = Counter(answer.ways[how].verdict for answer in answers)
     words = claims.families[answers[0].family].words.model_dump().values()
-    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in words)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in dict.fromkeys(words))
 
 
 def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
@@ -80,7 +75,7 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
             note += f" No claim can have a verdict: {too_few(seeds)}."
         yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
         for how in own[0].ways:
-            frame = tables.parts(own, how, {})
+            frame = tables.parts_in_short(own, how)
             yield Section(f"Part by part: {how}", PARTS, frame, level=3)
 
 

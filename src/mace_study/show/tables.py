@@ -200,8 +200,8 @@ def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
     rows = []
     for answer in answers:
         said = [Cell([Value(answer.ways[how].verdict, best=True)]) for how in ways]
-        rows.append([answer.claim, answer.statement, *said, answer.paper])
-    frame = pd.DataFrame(rows, columns=["", "statement", *ways, "the paper's Table 1"])
+        rows.append([answer.claim, *said, answer.statement, answer.paper])
+    frame = pd.DataFrame(rows, columns=["", *ways, "statement", "the paper's Table 1"])
     return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
 
 
@@ -225,6 +225,15 @@ def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.D
     heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
     heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
     return pd.DataFrame(rows, columns=[*heads, ""])
+
+
+def parts_in_short(answers: Sequence[Answer], how: str) -> pd.DataFrame:
+    """What each part came out as, and what decided it; `parts` has the rest."""
+    frame = parts(answers, how, {})
+    frame = frame.set_axis(["", *frame.columns[1:-1], "outcome"], axis=1)
+    sized = frame["outcome"].isin(["shown", "reversed"]) & (frame["size"] != "open")
+    frame["outcome"] = frame["outcome"].where(~sized, frame["outcome"] + ", " + frame["size"])
+    return frame[["", "outcome", "environment", "metric", "over", "difference", "p"]]
 
 
 def _by_size(part: Finding, digits: int) -> list[str | Cell]:

@@ -31,30 +31,27 @@ COLOURS = ("#949494", "#56b4e9", "#ca9161")
 def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
     """A row per way of measuring, claim and world.
 
-    Columns: measured (in which way), claim, statement, world, outcome, verdict, parts, shown (how
-    many of these), worth (how many of those are worth mentioning), least_room and most_room (of its
-    parts, in margins).
+    Columns: measured (in which way), claim, statement, world, outcome, verdict; difference, low,
+    high and p_holm of its best-supported part, that with the smallest p.
     """
     rows = [
-        (how, answer.claim, answer.statement, world, *_counted(judged))
+        (how, answer.claim, answer.statement, world, *_best_supported(judged))
         for world, answers in worlds.items()
         for answer in answers
         for how, judged in answer.ways.items()
     ]
-    names = ["measured", "claim", "statement", "world", "outcome", "verdict", "parts", "shown"]
-    return pd.DataFrame(rows, columns=[*names, "worth", "least_room", "most_room"])
+    names = ["measured", "claim", "statement", "world", "outcome", "verdict"]
+    return pd.DataFrame(rows, columns=[*names, "difference", "low", "high", "p_holm"])
 
 
-def _counted(judged: Judgement) -> tuple[Any, ...]:
-    parts = judged.parts
-    shown = [part for part in parts if part.outcome == "shown"]
-    worth = sum(part.size == "worth mentioning" for part in shown)
-    room = [part.room / part.worth_mentioning for part in parts]
-    return judged.outcome, judged.verdict, len(parts), len(shown), worth, min(room), max(room)
+def _best_supported(judged: Judgement) -> tuple[Any, ...]:
+    part = min(judged.parts, key=lambda part: (part.p_holm, -abs(part.difference)))
+    verdict = judged.outcome, judged.verdict
+    return *verdict, part.difference, part.low, part.high, part.p_holm
 
 
 def draw_verdicts(table: pd.DataFrame) -> Figure:
-    """A cell per claim and world in the verdict's colour; in it what is shown, and the room."""
+    """A cell per claim and world in the verdict's colour, with its best-supported difference."""
     claims = table.drop_duplicates("claim")
     named = zip(claims["claim"], claims["statement"], strict=True)
     said = {claim: wrapped(f"{claim} {statement}", 46) for claim, statement in named}
@@ -70,11 +67,9 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         for row in rows:
             left, height = worlds.index(row.world), heights[list(said).index(row.claim)]
             colour, _ = OUTCOMES[row.outcome]
-            size = f", {row.worth} worth mentioning" if row.shown else ""
-            room = " to ".join(
-                dict.fromkeys(f"{one:.3g}" for one in (row.least_room, row.most_room))
-            )
-            lines = f"{row.verdict}\n{row.shown} of {row.parts} shown{size}\nroom: {room} margins"
+            ends = (f"{end:.2g}" for end in (row.low, row.high))
+            verdict = row.verdict.replace(" (", "\n(")
+            lines = f"{verdict}\n{row.difference:.2g} ({' to '.join(ends)})"
             area = (
                 (left, left + 0.97),
                 (tops[row.claim] + 0.05,) * 2,
@@ -86,7 +81,7 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         axes.set_xticks(np.arange(len(worlds)) + 0.485, worlds)
         axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False)
         axes.spines[:].set_visible(False)
-        legend(figure, "A margin is what would be worth mentioning.")
+        legend(figure, "Number: the part with the smallest p, its difference and 95 % interval.")
     return figure
 
 
