@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from mace_rl.config.section import ConfigError
 from mace_study.config.labels import escaped, packages, require_latex
-from mace_study.config.study import Variant
+from mace_study.config.study import ShownVariant
 
 
 def allowed(label: str) -> bool:
     try:
-        Variant(label=label)
+        ShownVariant(label=label)
         require_latex(label, "label")
     except (ValidationError, ConfigError):
         return False

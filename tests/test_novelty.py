@@ -82,7 +82,7 @@ def test_both_parts_equal_brute_force(visited, scale):
     sample = known[batches[-1]]
     usual = np.sort(brute_distances(sample[:32], known, skip=1), axis=0)
     usual = 0.1 * usual[27] + 0.9 * usual[28]  # place 27.9 of 0 to 31 is 90 % of the way
-    np.testing.assert_allclose(novelty.usual_distances, usual, rtol=1e-4)
+    np.testing.assert_allclose(novelty.distance_thresholds, usual, rtol=1e-4)
     beyond = 1 - usual / brute_distances(states, known)
     found = novelty.knn_novelty(states)
     np.testing.assert_allclose(found, np.where(beyond > 0, beyond, 0).mean(1), atol=1e-4)
@@ -165,7 +165,7 @@ def test_all_is_brought_up_to_date_at_the_first_end_of_an_episode_after_so_many_
         taken = np.concatenate(episodes)[:steps:write_every]
         written = math.ceil(refreshed / write_every)
         assert novelty.visited.tolist() == taken[:written].tolist()
-        assert novelty.waiting.tolist() == taken[written:].tolist()
+        assert novelty.pending.tolist() == taken[written:].tolist()
         for same in (novelty(probes) == before, novelty.density.network.parameters == weights):
             assert same.all() != bool(due)
 

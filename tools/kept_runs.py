@@ -5,7 +5,7 @@
     .venv/bin/python -m tools.kept_runs unpack ARCHIVE RESULTS --sample 3       (make verify)
 
 Of RESULTS/runs/ENV/VARIANT/seedN are kept `episodes.csv` and `run.json`, which has the digests of
-what is not kept; of seed100 the agent too, unless it is large, which the report shows at play.
+what is not kept.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
 without those that the others tell, and each in the form that takes least room: as text, as doubles,
 or as six digits with an exponent. Packing again adds seeds to those that are there; equal runs give
@@ -33,14 +33,13 @@ from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.training.records import EpisodeRecord
 
-AT_PLAY, LARGEST = "seed100", 200_000  # the seed whose agent is kept, and its bytes at most
 LONGEST = 60  # seconds of a run in a sample
 # What an archive expands to at most, and the memory that this may take, bytes. Ours have 8 MB.
 EXPANDED, MEMORY = 1 << 26, 1 << 27
 COLUMNS = [name for name in get_type_hints(EpisodeRecord) if name not in ("episode", "env_steps")]
 MEMBERS = re.compile(
     rf"({'|'.join(COLUMNS)})(\.doubles|\.digits)?"
-    rf"|seed[0-9]{{1,10}}/{files.RECORD}|{AT_PLAY}/{files.AGENT}"
+    rf"|seed[0-9]{{1,10}}/{files.RECORD}"
 )
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*\.tar\.xz"
 DAMAGE = (tarfile.TarError, lzma.LZMAError, OSError, EOFError)
@@ -186,10 +185,7 @@ def pack(results: Path, archives: Path) -> int:
             before = packed.get(f"{run.name}/{files.RECORD}")
             if before and json.loads(before)["outputs"] != whole.record["outputs"]:
                 raise ValueError(f"{run}: {archive} has another run of this seed")
-            kept = [files.EPISODES]
-            if run.name == AT_PLAY and (run / files.AGENT).stat().st_size <= LARGEST:
-                kept.append(files.AGENT)
-            content |= {f"{run.name}/{name}": whole.content(name) for name in kept}
+            content[f"{run.name}/{files.EPISODES}"] = whole.content(files.EPISODES)
             content[f"{run.name}/{files.RECORD}"] = (run / files.RECORD).read_bytes()
         if content != packed:  # compressing takes seconds
             write(archive, content)

@@ -23,20 +23,20 @@ SMALLEST_SPREAD = 0.01  # of reward: where returns differ by less, nothing is un
 
 @kernel
 def relevance(
-    similarity: np.ndarray, recalled: np.ndarray, usual: float, spread: float
+    similarity: np.ndarray, recalled: np.ndarray, mean_return: float, spread: float
 ) -> np.ndarray:
     """Memory relevance in [0, 1], float64 [N]: 1 - similarity · unproductivity.
 
     similarity, recalled: float32 [N], the latter the remembered return-to-go. A state is
-    unproductive as far as less came of it than is `usual`, in units of the `spread` of what memory
-    holds, at most 1; where hardly any returns differ, none is. A single lucky return does not make
-    all others unproductive: it moves what is usual only by as much as it is rare.
+    unproductive as far as less came of it than the `mean_return`, in units of the `spread` of what
+    memory holds, at most 1; where hardly any returns differ, none is. A single lucky return does
+    not make all others unproductive: it moves the mean only by as much as it is rare.
     """
     result = np.empty(len(similarity))
     for n in range(len(similarity)):
         unproductivity = np.float32(0)
         if spread > SMALLEST_SPREAD:
-            unproductivity = (np.float32(usual) - recalled[n]) / np.float32(spread)
+            unproductivity = (np.float32(mean_return) - recalled[n]) / np.float32(spread)
             if unproductivity < 0:  # so written, NaN stays NaN
                 unproductivity = np.float32(0)
             elif unproductivity > 1:
@@ -87,7 +87,7 @@ class Curiosity(Stateful, IntrinsicReward):
         if self.memory.neighbours is None:
             return Bonus(new, new, np.ones(len(new)), np.zeros(len(new)))
         recalled, similarity = self.memory.recall(states)
-        relevant = relevance(similarity, recalled, self.usual, self.spread)
+        relevant = relevance(similarity, recalled, self.mean_return, self.spread)
         return Bonus(new * relevant, new, relevant, similarity)
 
     def scale(self) -> np.ndarray:
@@ -116,7 +116,7 @@ class Curiosity(Stateful, IntrinsicReward):
         if self.memory is not None and len(self.memory) > 0:
             self.memory.build_index(self.normaliser.mean, self.scale())
             returns = self.memory.values[: len(self.memory), -1].astype(np.float64)
-            self.usual, self.spread = mean(returns), math.sqrt(variance(returns))
+            self.mean_return, self.spread = mean(returns), math.sqrt(variance(returns))
 
     def _memorise(self, memory: EpisodicMemory, episode: Episode, returns: np.ndarray) -> None:
         # One step in so many, counted across episodes, and the last, which had the outcome.

@@ -112,8 +112,8 @@ class DensityNovelty(Stateful, Novelty):
     """
 
     STATE = (
-        *("buffer", "seen", "steps", "refreshed", "waiting", "optimiser", "batches"),
-        *("usual_distances", "usual_log_density", "mean", "std", "varied"),
+        *("buffer", "seen", "steps", "refreshed", "pending", "optimiser", "batches"),
+        *("distance_thresholds", "log_density_threshold", "mean", "std", "varied"),
     )
 
     def __init__(
@@ -125,12 +125,12 @@ class DensityNovelty(Stateful, Novelty):
         self.seen = 0  # states in the buffer
         self.steps = 0  # states ever observed, of which one in `write_every` is written
         self.refreshed = 0  # value of `steps` at the last refresh
-        self.waiting = np.empty((0, size), np.float32)  # states to write at the next one
+        self.pending = np.empty((0, size), np.float32)  # states to write at the next one
         self.density = DensityEstimator(size, config.density_hidden_units, streams["density"])
         self.optimiser = Adam(self.density.network.parameters, config.density_learning_rate)
         self.batches = streams["density_batches"]
-        self.usual_distances = np.zeros(len(config.neighbours))  # d*
-        self.usual_log_density = 0.0  # l*
+        self.distance_thresholds = np.zeros(len(config.neighbours))  # d*
+        self.log_density_threshold = 0.0  # l*
         self.ensemble = np.array(sorted(config.neighbours))
         self.largest = max(config.neighbours)
         self._build_index(normaliser)
@@ -157,17 +157,17 @@ class DensityNovelty(Stateful, Novelty):
     def knn_novelty(self, states: np.ndarray) -> np.ndarray:
         """The k-NN part, [T, observation] → float64 [T] in [0, 1)."""
         squared_distances, _ = self.neighbours.nearest(states, self.largest)
-        return shares_beyond(squared_distances, self.ensemble, self.usual_distances)
+        return shares_beyond(squared_distances, self.ensemble, self.distance_thresholds)
 
     def density_novelty(self, states: np.ndarray) -> np.ndarray:
         """The density part, [T, observation] → float64 [T] in [0, 1]."""
         log_probs = self.density.log_prob(standardised(states, self.mean, self.std, np.inf))
-        return improbability(log_probs, self.usual_log_density, self.dimensions)
+        return improbability(log_probs, self.log_density_threshold, self.dimensions)
 
     def observe(self, states: np.ndarray) -> None:
         """Take in an episode's states, one in `write_every` to be written at the next refresh."""
         chosen = states[-self.steps % self.config.write_every :: self.config.write_every]
-        self.waiting = np.concatenate([self.waiting, chosen])
+        self.pending = np.concatenate([self.pending, chosen])
         self.steps += len(states)
         if self.steps - self.refreshed >= self.config.refresh_every:
             self.refresh()
@@ -175,15 +175,15 @@ class DensityNovelty(Stateful, Novelty):
     def refresh(self) -> None:
         """Write what waits, train the density estimator, and measure the thresholds.
 
-        Whether a waiting state is new is judged by the old thresholds: the new ones depend on it.
+        Whether a pending state is new is judged by the old thresholds: the new ones depend on it.
         """
-        free = self.waiting[: len(self.buffer) - self.seen]
+        free = self.pending[: len(self.buffer) - self.seen]
         self.buffer[self.seen : self.seen + len(free)] = free
         self.seen += len(free)
         self._build_index(self.normaliser)
-        if len(self.waiting) > len(free) and self._replace_redundant(self.waiting[len(free) :]):
+        if len(self.pending) > len(free) and self._replace_redundant(self.pending[len(free) :]):
             self._build_index(self.normaliser)
-        self.waiting, self.refreshed = self.waiting[:0], self.steps
+        self.pending, self.refreshed = self.pending[:0], self.steps
         if self.seen <= self.largest:
             return
         shape = self.config.density_steps, self.config.density_batch_size
@@ -192,12 +192,12 @@ class DensityNovelty(Stateful, Novelty):
             self.optimiser.step(-self.density.gradient(self.normaliser(sample)))
         log_probs = self.density.log_prob(self.normaliser(samples[-1]))
         require_finite("a log-density", log_probs)
-        self.usual_log_density = quantile(log_probs.astype(np.float64), 1 - KNOWN)
+        self.log_density_threshold = quantile(log_probs.astype(np.float64), 1 - KNOWN)
         known = samples[-1][: self.config.calibration_states]
         squared_distances, _ = self.neighbours.nearest(known, self.largest + 1)
         others = np.ascontiguousarray(squared_distances[:, 1:])  # the nearest is itself
         distances = np.ascontiguousarray(mean_distances(others, self.ensemble).T)
-        self.usual_distances = np.array([quantile(column, KNOWN) for column in distances])
+        self.distance_thresholds = np.array([quantile(column, KNOWN) for column in distances])
 
     def _replace_redundant(self, states: np.ndarray) -> bool:
         """Let states far from the buffer replace entries close to others; whether any was replaced.
@@ -240,27 +240,27 @@ def mean_distances(squared_distances, neighbours):
 
 
 @kernel
-def shares_beyond(squared_distances, neighbours, usual):
-    """The mean over the ensemble of 1 - d*/d where d is beyond the `usual` d*, else 0: [T].
+def shares_beyond(squared_distances, neighbours, thresholds):
+    """The mean over the ensemble of 1 - d*/d where d is beyond its threshold d*, else 0: [T].
 
     d: of `mean_distances`. Where states repeat exactly, d, d* and the result are 0.
     """
     distances = mean_distances(squared_distances, neighbours)
     result = np.zeros(len(squared_distances))
     for t in range(len(distances)):
-        for i in range(len(usual)):
-            if not distances[t, i] <= usual[i]:  # so written, NaN stays NaN
-                result[t] += 1 - usual[i] / distances[t, i]
-        result[t] /= len(usual)
+        for i in range(len(thresholds)):
+            if not distances[t, i] <= thresholds[i]:  # so written, NaN stays NaN
+                result[t] += 1 - thresholds[i] / distances[t, i]
+        result[t] /= len(thresholds)
     return result
 
 
 @kernel
-def improbability(log_probs, usual, dimensions):
-    """1 - exp(-(l* - l) / D) where l is below the `usual` l*, else 0: float64 [T]."""
+def improbability(log_probs, threshold, dimensions):
+    """1 - exp(-(l* - l) / D) where l is below the threshold l*, else 0: float64 [T]."""
     result = np.zeros(len(log_probs))
     for t in range(len(log_probs)):
-        below = np.float32(usual) - log_probs[t]
+        below = np.float32(threshold) - log_probs[t]
         if not below <= 0:  # so written, NaN stays NaN
             result[t] = 1 - exp(-below / np.float32(dimensions))
     return result

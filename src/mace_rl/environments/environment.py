@@ -142,7 +142,7 @@ class Environment(Spaces):
             raise
         terminated = bool(self.number("terminated", terminated, number))
         truncated = bool(self.number("truncated", truncated, number))
-        return observation, self.paid(reward, number), terminated, truncated
+        return observation, self.checked_reward(reward, number), terminated, truncated
 
     @property
     def generator(self) -> np.random.Generator:

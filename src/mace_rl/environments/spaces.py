@@ -82,7 +82,7 @@ class Spaces:
             )
         return found
 
-    def paid(self, reward: Any, step: int) -> float:
+    def checked_reward(self, reward: Any, step: int) -> float:
         """The reward of a step, checked."""
         number = float(self.number("reward", reward, step))
         require_finite("the reward", number, _after(step), TOO_LARGE)

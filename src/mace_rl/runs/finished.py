@@ -179,7 +179,7 @@ def finished(config: RunConfig, directory: Path) -> bool:
     except ConfigError as error:
         raise ConfigError(f"{error}; {WAY_OUT}") from None
     if found != wanted:
-        what = f"a finished run {otherwise(found, wanted, config)}"
+        what = f"a finished run {difference_from(found, wanted, config)}"
         raise ConfigError(f"{directory} holds {what}; {WAY_OUT}")
     try:
         for name in files.RESULTS:
@@ -189,7 +189,7 @@ def finished(config: RunConfig, directory: Path) -> bool:
     return True
 
 
-def otherwise(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
+def difference_from(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
     """How the run with the identity `found` differs from the `wanted` one of `config`, in words."""
     code = " or ".join([*config.references().values(), "mace_rl"])
     only_code = found | {"sources": wanted["sources"]} == wanted

@@ -65,7 +65,7 @@ class Finished(Record):
     config: Named
 
 
-class Told(Record):
+class Progress(Record):
     """What is needed of a run's progress."""
 
     episode: int
@@ -76,21 +76,21 @@ class Told(Record):
     left: float
 
 
-def cells(told: Mapping[str, Any]) -> dict[str, str]:
-    """The columns for a run that trains; told: by `mace_rl.runs.run.how_far`."""
-    early = told["seconds"] - told["start_seconds"] < 1
+def cells(progress: Mapping[str, Any]) -> dict[str, str]:
+    """The columns for a run that trains; progress: by `mace_rl.runs.run.progress_of`."""
+    early = progress["seconds"] - progress["start_seconds"] < 1
     return {
-        "episode": f"{told['episode']}/{told['episodes']}",
-        "return": f"{told['recent_return']:.1f}",
-        "β": f"{told['beta']:.2f}",
-        "steps/s": "" if early else f"{told['steps_per_second']:.0f}",
-        "left": duration(own_estimate(told)),
+        "episode": f"{progress['episode']}/{progress['episodes']}",
+        "return": f"{progress['recent_return']:.1f}",
+        "β": f"{progress['beta']:.2f}",
+        "steps/s": "" if early else f"{progress['steps_per_second']:.0f}",
+        "left": duration(own_estimate(progress)),
     }
 
 
-def own_estimate(told: Mapping[str, Any]) -> float:
+def own_estimate(progress: Mapping[str, Any]) -> float:
     """Seconds to a run's end from its speed so far; NaN early, when episodes' lengths change."""
-    return told["left"] if told["episode"] >= EARLY * told["episodes"] else math.nan
+    return progress["left"] if progress["episode"] >= EARLY * progress["episodes"] else math.nan
 
 
 def duration(seconds: float) -> str:
@@ -112,11 +112,11 @@ def line(file: TextIO) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     if in_place:
         file.write("starting: the first episode waits for its code to be compiled\r")
 
-    def show(told: Mapping[str, Any]) -> None:
+    def show(progress: Mapping[str, Any]) -> None:
         nonlocal due
         if time.monotonic() >= due:
             due = time.monotonic() + pause
-            text = "   ".join(f"{name} {text}" for name, text in cells(told).items() if text)
+            text = "   ".join(f"{name} {text}" for name, text in cells(progress).items() if text)
             file.write(f"{before}{text}{after}")
             file.flush()
 
@@ -164,28 +164,28 @@ class Run:
         self.work, self.name = planned.work, name
         since = began if planned.due else 0.0  # older files are of an earlier attempt
         record = read(folder / files.RECORD, since, Record)
-        told = read(folder / files.PROGRESS, since, Told)
-        self.told = told or {}
+        progress = read(folder / files.PROGRESS, since, Progress)
+        self.progress = progress or {}
         self.seconds = math.nan  # of the whole training, if known
         if record:
             self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]
         elif held(folder / files.LOCK):
             self.state = "running"
         else:
-            self.state = "stopped" if told else "waiting"
-        if self.state == "running" and told:
-            self.seconds = told["seconds"] - told["start_seconds"] + own_estimate(told)
+            self.state = "stopped" if progress else "waiting"
+        if self.state == "running" and progress:
+            self.seconds = progress["seconds"] - progress["start_seconds"] + own_estimate(progress)
 
     def left(self, expected: float) -> float:
         """Seconds to its end: its own estimate, or as if it takes `expected` seconds."""
-        known = own_estimate(self.told) if self.told else math.nan
-        spent = self.told["seconds"] - self.told["start_seconds"] if self.told else 0.0
+        known = own_estimate(self.progress) if self.progress else math.nan
+        spent = self.progress["seconds"] - self.progress["start_seconds"] if self.progress else 0.0
         return expected - spent if math.isnan(known) else known
 
     def row(self) -> dict[str, str]:
         """Its row in the table."""
         shown = dict.fromkeys(("episode", "return", "β", "steps/s", "left"), "")
-        shown |= cells(self.told) if self.told else {"episode": "starting"}
+        shown |= cells(self.progress) if self.progress else {"episode": "starting"}
         shown |= {"left": "stopped"} if self.state == "stopped" else {}
         what = {"environment": self.env, "variant": self.variant, "seed": str(self.seed)}
         return ({"folder": self.name} if self.name else {}) | what | shown

@@ -24,7 +24,7 @@ from mace_rl.base.rng import Streams
 from mace_rl.config.run import IDENTITY, RunConfig
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
-from mace_rl.runs.finished import WAY_OUT, finished, otherwise
+from mace_rl.runs.finished import WAY_OUT, difference_from, finished
 from mace_rl.training import resuming
 from mace_rl.training.published import PublishedTrainer
 from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
@@ -58,7 +58,7 @@ def run(
 ) -> None:
     """Train as `config` says, on one thread, and leave the results in `directory`.
 
-    observe: is told `how_far` the run is, as a file in `directory` is.
+    observe: gets `progress_of` the run, as a file in `directory` does.
     keep_checkpoint: keep a last one, from which deleted results come back without training.
     after_episode: is called with each episode after the update on it.
     aside: what is moved into a folder below `directory`: files of "others" than this run, or "all".
@@ -87,7 +87,7 @@ def run(
         if state is not None:
             resume(trainer, clock, state)
         checkpoint.require_plain(trainer.state_dict(), "state")  # now rather than after minutes
-        told = directory / files.PROGRESS
+        file = directory / files.PROGRESS
 
         def save() -> None:
             with clock.saving():
@@ -102,8 +102,8 @@ def run(
                 clock.start_seconds = time.monotonic() - started
             if time.monotonic() >= clock.next_progress:
                 clock.next_progress = time.monotonic() + PROGRESS_SECONDS
-                progress = how_far(trainer, clock)
-                write_atomically(told, json.dumps(progress))
+                progress = progress_of(trainer, clock)
+                write_atomically(file, json.dumps(progress))
                 if observe:
                     observe(progress)
             if clock.checkpoint_due():
@@ -113,7 +113,7 @@ def run(
         write_results(directory, trainer, identity, clock)
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
-        told.unlink(missing_ok=True)
+        file.unlink(missing_ok=True)
 
 
 def to_continue(
@@ -134,7 +134,7 @@ def to_continue(
         try:
             content = checkpoint.read(path)
             others = content["identity"] != identity
-            other = f" {otherwise(content['identity'], identity, config)}" if others else ""
+            other = f" {difference_from(content['identity'], identity, config)}" if others else ""
             reason = f"{directory} holds an unfinished run{other}"
         except checkpoint.CheckpointError as error:
             reason = str(error)
@@ -266,7 +266,7 @@ def exclusive(directory: Path) -> Iterator[int]:
         yield file.fileno()
 
 
-def how_far(trainer: Trainer, clock: Clock) -> dict[str, Any]:
+def progress_of(trainer: Trainer, clock: Clock) -> dict[str, Any]:
     """A run's progress; `left`, seconds to its end, if episodes stay as long as the last 50."""
     records, episodes, seconds = trainer.records, trainer.config.episodes, clock.elapsed()
     last, recent = records[-1], records[-50:]

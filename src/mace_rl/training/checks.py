@@ -42,10 +42,15 @@ class Checked:
     """A part of which everything is as it is, but for what a subclass checks."""
 
     def __init__(self, part: Any) -> None:
-        self.part = part
+        object.__setattr__(self, "part", part)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "part":  # of a copy that is being made
+            raise AttributeError(name)
         return getattr(self.part, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self.part, name, value)
 
 
 class CheckedBeta(Checked):

@@ -79,7 +79,9 @@ class Trainer:
         while steps < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes:
             with Located(self.config, f"episode {len(self.records) + 1}"):
                 episode = self.play_episode(policy)
-                rollout.append(self.advantages(episode))
+                item = self.advantages(episode)
+                own_units = self.config.ppo.normalise_returns
+                rollout.append(item.with_normalised_returns() if own_units else item)
                 steps += len(episode)
         return rollout
 
@@ -107,8 +109,7 @@ class Trainer:
             self.curiosity.remember(episode, returns)
             self.controller.next_episode(episode, bonus.reward)
         self.record(episode, bonus, beta)
-        item = Experience(episode, observations[:-1], beta, bonus, extrinsic, intrinsic)
-        return item.with_normalised_returns() if self.config.ppo.normalise_returns else item
+        return Experience(episode, observations[:-1], beta, bonus, extrinsic, intrinsic)
 
     def record(self, episode: Episode, bonus: Bonus | None, beta: float) -> None:
         """Its row of `episodes.csv`."""

@@ -35,7 +35,7 @@ class Recording:
 
     beta: float
     unit: float  # see `CuriosityTracker.unit`
-    usual: float  # R_curiosity that is paid with 0
+    baseline: float  # R_curiosity that is paid with 0
     visits: np.ndarray  # to each Discrete state so far, [observation]; 0 for Box ones
     observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
@@ -55,14 +55,14 @@ class Recording:
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
         """From the tensors of `state_dict` as arrays."""
-        beta, unit, usual, visits, *lists = state.values()
-        return cls(beta.item(), unit.item(), usual.item(), visits, *map(list, lists))
+        beta, unit, baseline, visits, *lists = state.values()
+        return cls(beta.item(), unit.item(), baseline.item(), visits, *map(list, lists))
 
 
 class CuriosityTracker(Stateful):
     """The curiosity bonus for unfinished episodes of several environments."""
 
-    STATE = ("curiosity", "controller", "scales", "paid", "count", "recordings", "steps")
+    STATE = ("curiosity", "controller", "scales", "bonus_sum", "count", "recordings", "steps")
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
         self.config, self.spaces = config, spaces
@@ -75,7 +75,7 @@ class CuriosityTracker(Stateful):
             require_usable(config.beta.rule, self.controller, environments)
         smallest = {"extrinsic": 1.0, "curiosity": TINY}
         self.scales = {kind: RewardScale(config.discount, x) for kind, x in smallest.items()}
-        self.paid, self.count = 0.0, 0  # R_curiosity of all ended episodes, and their steps
+        self.bonus_sum, self.count = 0.0, 0  # R_curiosity of all ended episodes, and their steps
         self.recordings: list[Recording | None] = [None] * environments
         self.steps = 0  # of whole episodes since the agent's last update
 
@@ -92,9 +92,9 @@ class CuriosityTracker(Stateful):
             self.end(environment, terminated=False)
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
         require_within("β", beta, largest=LARGEST_BETA)
-        usual = self.paid / self.count if self.config.centred and self.count else 0.0
+        baseline = self.bonus_sum / self.count if self.config.centred and self.count else 0.0
         visits = np.zeros(len(first))
-        self.recordings[environment] = Recording(beta, self.unit, usual, visits, [first])
+        self.recordings[environment] = Recording(beta, self.unit, baseline, visits, [first])
 
     def as_recorded(self, action: Any) -> Any:
         """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
@@ -114,7 +114,7 @@ class CuriosityTracker(Stateful):
         if recording is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
         step = len(recording.rewards) + 1
-        reward = self.spaces.paid(reward, step)
+        reward = self.spaces.checked_reward(reward, step)
         state = np.array(self.spaces.encode(observation, step))  # a copy
         found = self.curiosity.of_states(state[None], recording.visits)
         bonus, novelty, relevance = (float(part[0]) for part in found[:3] if part is not None)
@@ -127,7 +127,7 @@ class CuriosityTracker(Stateful):
         recording.observations.append(state)
         recording.rewards.append(reward)
         recording.bonus.append(bonus)
-        paid = recording.beta * recording.unit * (bonus - recording.usual)
+        paid = recording.beta * recording.unit * (bonus - recording.baseline)
         values = (reward, paid, bonus, novelty, relevance, recording.beta)
         return dict(zip(PARTS, values, strict=True))
 
@@ -139,7 +139,7 @@ class CuriosityTracker(Stateful):
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
         self.scales["extrinsic"].update(episode.rewards)
         self.scales["curiosity"].update(bonus)
-        self.paid, self.count = self.paid + total(bonus), self.count + len(episode)
+        self.bonus_sum, self.count = self.bonus_sum + total(bonus), self.count + len(episode)
         self.curiosity.remember(episode, discounted_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)

@@ -115,9 +115,9 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
-        taken = self.tracker.as_recorded(action)
+        recorded = self.tracker.as_recorded(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        parts = self.tracker.reward_parts(0, taken, reward, observation)
+        parts = self.tracker.reward_parts(0, recorded, reward, observation)
         if terminated or truncated:
             self.tracker.end(0, bool(terminated))
         total = parts["reward_extrinsic"] + parts["reward_curiosity"]
@@ -146,7 +146,7 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """The environments' step, with other rewards, float64, and more in `infos`."""
-        taken = [self.tracker.as_recorded(action) for action in actions]
+        recorded = [self.tracker.as_recorded(action) for action in actions]
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
         reached = observations
@@ -157,16 +157,16 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
         fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
         values = np.zeros((len(PARTS), self.num_envs))
         for i in np.flatnonzero(~fresh).tolist():
-            parts = self.tracker.reward_parts(i, taken[i], rewards[i], reached[i])
+            parts = self.tracker.reward_parts(i, recorded[i], rewards[i], reached[i])
             values[:, i] = list(parts.values())
         for i in np.flatnonzero(ended).tolist():
             self.tracker.end(i, bool(terminated[i]))
         for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
             self.tracker.begin(i, observations[i])
         total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
-        told = dict(zip(PARTS, values, strict=True))
+        added = dict(zip(PARTS, values, strict=True))
         masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)
-        return observations, total, terminated, truncated, {**infos, **told, **masks}
+        return observations, total, terminated, truncated, {**infos, **added, **masks}
 
 
 def given(arguments: dict[str, Any]) -> dict[str, Any]:
