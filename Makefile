@@ -195,7 +195,7 @@ lock: ## write environment.lock anew from pyproject.toml (UPGRADE=1: take newer 
 	cat environment.lock environment-cuda.lock >"$$folder/lock"
 	unset $${!UV_@} # the machine's settings must not show in the lock
 	"$$folder/bin/python" -m uv pip compile pyproject.toml --python-version=3.11 \
-	    $(addprefix --extra=,study slurm tensorboard dev) --python-platform=linux --generate-hashes --no-header --no-emit-index-url \
+	    $(addprefix --extra=,study minigrid slurm tensorboard dev) --python-platform=linux --generate-hashes --no-header --no-emit-index-url \
 	    --no-emit-find-links --no-config --quiet $(if $(UPGRADE),--upgrade) -o "$$folder/lock"
 	grep -q $(TORCH_CPU_HASH) "$$folder/lock" ||
 	    sed -i 's/^$(TORCH) .*/&\n    --hash=$(TORCH_CPU_HASH) \\/' "$$folder/lock"

@@ -118,7 +118,7 @@ def test_another_paper_has_its_tables_verdicts_and_pictures(folder):
     shape = all_metrics(settings), study.environments, study.variants, 12
     runs = table_for_tables(*shape, final_return=values, early_return=equal)
     answers = ledger(runs, settings, paper)
-    assert [one.ways["by return"].verdict for one in answers] == ["reproduced", "not reproduced"]
+    assert [one.ways["by return"].verdict for one in answers] == ["holds", "fails"]
     assert answers[0].paper == "final_return: A 180.5, B 320; the best is B"
     assert answers[0].ways["by return"].parts[0].in_paper == 139.5
     table1, rest = split(summary(runs, settings, paper.table1), paper.table1)

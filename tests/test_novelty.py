@@ -57,7 +57,7 @@ def test_counts_by_hand():
         assert novelty(first).tolist() == [1, 1, 1 / 2, 1 / 3]
     novelty.observe(first)  # counts 3, 1 → 1½, ½
     assert novelty(one_hot(0, 1, 2)).tolist() == [1 / 2.5, 1 / 1.5, 1]
-    visits = np.array([1.0, 0, 2, 0])  # earlier in the same episode
+    visits = {one_hot(0).tobytes(): 1, one_hot(2).tobytes(): 2}  # earlier in the same episode
     assert novelty.continued(one_hot(0, 2, 2), visits).tolist() == [1 / 3.5, 1 / 3, 1 / 4]
     novelty.observe(one_hot(2, 2))  # 1½, ½, 2 → ¾, ¼, 1
     assert novelty(one_hot(0, 1, 2, 2)).tolist() == [1 / 1.75, 1 / 1.25, 1 / 2, 1 / 3]

@@ -129,14 +129,14 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     for world, answers in ledgers.items():
         for answer in answers:
             judged, row = answer.ways[ROBUST], found.loc[(answer.claim, world)]
-            assert (row["verdict"], row["parts"]) == (judged.verdict, len(judged.parts))
-            shown = [part for part in judged.parts if part.outcome == "shown"]
-            assert row["shown"] == len(shown)
-            assert row["worth"] == sum(part.size == "worth mentioning" for part in shown)
-    assert found.loc[("C1", "plain"), ["shown", "worth"]].tolist() == [2, 2]
+            assert (row["verdict"], row["outcome"]) == (judged.verdict, judged.outcome)
+            assert row["p_holm"] == min(part.p_holm for part in judged.parts)
+            numbers = {(part.p_holm, part.difference, part.low) for part in judged.parts}
+            assert tuple(row[["p_holm", "difference", "low"]]) in numbers
+    assert found.loc[("C1", "plain"), "low"] > 0
     page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
     row, _, *each = re.findall(r"\| C1 \|.*", page)  # robust, by the paper's words, its two parts
-    assert row.count("reproduced; 2 of 2 shown") == 1 and row.count("; 0 of 2 shown") == 2
+    assert row.count("| reproduced: ") == 1 and row.count("| not reproduced: ") == 2
     for number, cells in enumerate(line.split(" | ")[4:] for line in each):
         for cell, answers in zip(cells, ledgers.values(), strict=True):
             part = answers[0].ways[ROBUST].parts[number]

@@ -88,17 +88,19 @@ def records(table: pd.DataFrame) -> Any:
 
 def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]:
     """The tables in words, for README.md."""
-    said = "{verdict}; {shown} of {parts} shown; room {least_room:.3g} to {most_room:.3g}"
     sections = []
     ways = tables["verdicts"].groupby("measured") if "verdicts" in tables else ()
     for way, own in sorted(ways, key=lambda pair: pair[0] != DECIDES):
-        rows: Any = own.to_dict("records")
-        long = own.assign(said=[said.format(**row) for row in rows])
+        said = [
+            f"{row.verdict}: {worlds.difference(row.difference, row.low, row.high)}"
+            for row in records(own)
+        ]
+        long = own.assign(said=said)
         wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
         order = long[["claim", "statement"]].drop_duplicates()
         frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")
         decides = "These decide" if way == DECIDES else "These do not decide"
-        note = f"{decides}. Room: of its parts, in margins."
+        note = f"{decides}. Number: the part with the smallest p, its difference and 95 % interval."
         sections.append(Section(f"Verdicts: {way}", note, frame))
     table = tables["numbers"]
     cells = table.assign(

@@ -59,6 +59,8 @@ def parser() -> argparse.ArgumentParser:
     several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
     over = "YAML files read over the default settings, one after the other"
     add("--config", type=path, **several, help=over)
+    around = "a wrapper around the environment, module:Class; several: the innermost first"
+    add("--wrapper", action="append", metavar="NAME", help=around)
     slower = "of policy and critics: compiled (default) or plain PyTorch, slower, to check it by"
     add("--engine", choices=["compiled", "torch"], help=slower)
     add("--out", type=path, help="folder for the results (default: runs/ENV/VARIANT/seedN)")
@@ -122,6 +124,7 @@ def run_config(arguments: argparse.Namespace) -> RunConfig:
     """The run that the command line asks for; raises `ConfigError`."""
     _require_at_least(1, arguments, "episodes", "max_episode_steps")
     changes = {key: getattr(arguments, key) for key in ("episodes", "max_episode_steps", "engine")}
+    changes["environment_wrappers"] = arguments.wrapper
     changes = {key: value for key, value in changes.items() if value is not None}
     changes |= {"seed": arguments.seed, "config": arguments.config}
     return settings(arguments.env, arguments.variant, **changes)

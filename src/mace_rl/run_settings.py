@@ -30,6 +30,9 @@ SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 OF_A_STUDY = {"results", "environments", "variants", "seeds", "environment_seeds"}
 OF_A_STUDY |= {"metrics", "figure", "claims"}
 
+# What names of environments have in them, the package that registers them, and our extra.
+PACKAGES = (("Bullet", "pybullet_envs_gymnasium", "study"), ("MiniGrid", "minigrid", "minigrid"))
+
 
 class Variant(Section):
     """One variant: how it is shown; its settings go over `training` and the environment's."""
@@ -173,11 +176,12 @@ def _registered(config: RunConfig) -> EnvSpec:
         import_module(name, key)  # which registers it
     own = name.rpartition(":")[2]
     if own not in registered():
-        if "Bullet" in own and importlib.util.find_spec("pybullet_envs_gymnasium") is None:
-            raise ConfigError(
-                f"{key} has {name!r}, but the package it needs should be installed: "
-                "mace-rl's extra [study] has it"
-            )
+        for part, package, extra in PACKAGES:
+            if part in own and importlib.util.find_spec(package) is None:
+                raise ConfigError(
+                    f"{key} has {name!r}, but the package it needs should be installed: "
+                    f"mace-rl's extra [{extra}] has it"
+                )
         hint = "" if ":" in name else f" (if a module registers it: module:{name})"
         check_known(own, registered(), key, f"Gymnasium's registry{hint}")
     spec = registered()[own]

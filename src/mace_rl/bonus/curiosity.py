@@ -1,10 +1,12 @@
 """The curiosity bonus: novelty × what the episodic memory says of similar states (paper)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium import Space
+from gymnasium.spaces import Discrete
 
 from mace_rl.base.rng import Streams
 from mace_rl.base.state import Stateful
@@ -60,7 +62,7 @@ class Curiosity(Stateful, IntrinsicReward):
         self,
         memory: MemoryConfig | None,
         novelty_config: NoveltyConfig,
-        observation_space: Box | Discrete,
+        observation_space: Space[Any],
         observation_size: int,
         streams: Streams,
     ) -> None:
@@ -75,7 +77,7 @@ class Curiosity(Stateful, IntrinsicReward):
         """R_curiosity of each step: novelty × relevance of the state it led to."""
         return self.of_states(episode.observations[1:])
 
-    def of_states(self, states: np.ndarray, visits: np.ndarray | None = None) -> Bonus:
+    def of_states(self, states: np.ndarray, visits: Mapping[bytes, int] | None = None) -> Bonus:
         """The bonus for states that an episode came to one after the other.
 
         states: float32 [N, observation]; visits: see `Novelty.continued`, if it goes on.

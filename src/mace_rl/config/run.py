@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, PositiveInt, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PositiveInt, model_validator
 
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.beta import BetaConfig, MetaConfig, PretrainedConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.published import COMPUTED, PublishedConfig
-from mace_rl.config.section import Arguments, Section, short_repr
+from mace_rl.config.section import Arguments, Reference, Section, short_repr
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
@@ -36,6 +36,17 @@ def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
 EnvironmentArguments = Annotated[Arguments, AfterValidator(_of_the_constructor)]
 
 
+class WrapperConfig(Section):
+    """A Gymnasium wrapper, "module:Class", made as Class(env, **arguments)."""
+
+    wrapper: Reference
+    arguments: Arguments = Field(default={})
+
+
+def _by_name(given: Any) -> Any:
+    return {"wrapper": given} if isinstance(given, str) else given
+
+
 class AgentConfig(Section):
     """What it takes to play with the agent of a run, whichever version of the method trained it."""
 
@@ -47,6 +58,8 @@ class AgentConfig(Section):
     episodes: PositiveInt
     max_episode_steps: PositiveInt | None = None  # None: the environment's own time limit
     environment_arguments: EnvironmentArguments = Field(default={})  # for its constructor
+    # Around it, the innermost first; None, not [], for what kept runs have no word of.
+    environment_wrappers: list[Annotated[WrapperConfig, BeforeValidator(_by_name)]] | None = None
     trainer: Literal["published"] | None = (
         None  # None: `training.trainer`; else `training.published`
     )
@@ -54,6 +67,11 @@ class AgentConfig(Section):
     ppo: PPOConfig
     published: PublishedConfig | None = None
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+    @property
+    def wrappers(self) -> list[tuple[str, dict[str, Any]]]:
+        """Those around the environment, the innermost first, with their arguments."""
+        return [(one.wrapper, one.arguments) for one in self.environment_wrappers or ()]
 
 
 class RunConfig(AgentConfig):
@@ -115,6 +133,8 @@ class RunConfig(AgentConfig):
             "novelty.estimator": self.novelty.estimator if self.novelty else None,
             "beta.rule": getattr(self.beta, "rule", None),
         }
+        for place, (wrapper, _) in enumerate(self.wrappers):
+            found[f"environment_wrappers.{place}"] = wrapper
         return {key: reference for key, reference in found.items() if reference is not None}
 
 

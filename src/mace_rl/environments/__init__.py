@@ -4,6 +4,7 @@ Classes are given by name: planning the workflow needs the ids without PyBullet,
 """
 
 from contextlib import suppress
+from importlib import import_module
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -31,7 +32,8 @@ for name, entry_point, steps, arguments in (
 
 
 def registered() -> dict[str, EnvSpec]:
-    """Gymnasium's registry, with Bullet's environments if they are installed."""
-    with suppress(ImportError):
-        import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0 and its siblings)
+    """Gymnasium's registry, with Bullet's and MiniGrid's environments if they are installed."""
+    for package in ("pybullet_envs_gymnasium", "minigrid"):  # which register them
+        with suppress(ImportError):
+            import_module(package)
     return gymnasium.registry

@@ -4,7 +4,7 @@ import copy
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from mace_rl.base.stdio import keep_open
-from mace_rl.config.plugins import import_module
+from mace_rl.config.plugins import import_module, make
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
 from mace_rl.environments.spaces import Spaces
@@ -49,6 +49,8 @@ def trying_out(what: str) -> Iterator[None]:
     try:
         with nothing_printed():
             yield
+    except ConfigError:
+        raise
     except (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled) as error:
         reason = f"{what} needs a package that should be installed: {error}"
         raise ConfigError(" ".join(reason.split())) from None
@@ -67,6 +69,7 @@ class Environment(Spaces):
     """
 
     clips_actions = True  # Box ones to their bounds
+    env: gymnasium.Env[Any, Any]
 
     def __init__(
         self,
@@ -74,7 +77,9 @@ class Environment(Spaces):
         seed: np.random.SeedSequence,
         max_episode_steps: int | None = None,
         arguments: Mapping[str, Any] | None = None,
+        wrappers: Sequence[tuple[str, Mapping[str, Any]]] = (),
     ) -> None:
+        """wrappers: around the environment, the innermost first, "module:Class" and arguments."""
         if ":" in name:
             import_module(name, "environment")
         registered()
@@ -91,10 +96,13 @@ class Environment(Spaces):
                 f"environment {name!r} has {found} (max_episode_steps), but whole episodes are "
                 f"kept; set one of 1 to {MOST_STEPS} steps"
             )
+        self.wrapped = bool(wrappers)  # by more than Gymnasium's own
         with trying_out(f"environment {name!r}{f' with {arguments}' if arguments else ''}"):
             self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
-            spaces = self.env.observation_space, self.env.action_space
-        super().__init__(name, *spaces)
+            for place, (reference, own) in enumerate(wrappers):
+                key = f"environment_wrappers.{place}"
+                self.env = make(reference, key, gymnasium.Env, False, self.env, **own)
+        super().__init__(name, self.env.observation_space, self.env.action_space)
         if isinstance(self.action_space, Box) and self.action_space.dtype.kind != "f":
             raise ConfigError(
                 f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "

@@ -23,8 +23,14 @@ class Spaces:
     """
 
     def __init__(
-        self, name: str, observations: gymnasium.Space[Any], actions: gymnasium.Space[Any]
+        self,
+        name: str,
+        observations: gymnasium.Space[Any],
+        actions: gymnasium.Space[Any],
+        in_part: bool = False,
     ) -> None:
+        """in_part: entries of a Dict that have no flat form are left out, where others have one."""
+        observations = flat_part(observations) if in_part else observations
         require_flat(name, observations)
         require_size(name, observations)
         self.given_space = observations  # of what `encode` gets
@@ -97,10 +103,31 @@ def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> Non
     elif not isinstance(space, FLAT):
         what = f"the observation{entry} is of {short_repr(space)}"
         raise ConfigError(
-            f"environment {name!r}: {what}, and not so many numbers at every step; "
-            "gymnasium.wrappers.FilterObservation leaves an entry out, TransformObservation makes "
-            "numbers of it"
+            f"environment {name!r}: {what}, and not so many numbers at every step; name a wrapper "
+            "that leaves it out, such as gymnasium.wrappers:FilterObservation, or makes numbers of "
+            "it: environment_wrappers, or --wrapper"
         )
+
+
+def flat_part(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
+    """A Dict without the entries that have no flat form, if any other has one; else the same."""
+    if not isinstance(space, Dict):
+        return space
+    parts = {key: flat_part(part) for key, part in space.items()}
+    flat: dict[str, Any] = {
+        key: part for key, part in parts.items() if isinstance(part, (*FLAT, Dict, Tuple))
+    }
+    return Dict(flat) if flat else space
+
+
+def is_discrete(space: gymnasium.Space[Any]) -> bool:
+    """Whether its elements are whole numbers, so that the same state comes again."""
+    match space:
+        case Dict() | Tuple():
+            return all(map(is_discrete, space.values() if isinstance(space, Dict) else space))
+        case Box():
+            return space.dtype.kind in "biu"
+    return isinstance(space, Discrete | MultiBinary | MultiDiscrete)
 
 
 def require_size(name: str, space: gymnasium.Space[Any]) -> None:

@@ -126,7 +126,7 @@ def film(
     globally = np.random.SeedSequence(seed)
     try:
         with seeded(globally):
-            environment = Environment(config.environment, seeds, limit, drawn)
+            environment = Environment(config.environment, seeds, limit, drawn, config.wrappers)
     except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
     environment.clips_actions = config.ppo.clip_actions

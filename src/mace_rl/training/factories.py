@@ -86,7 +86,7 @@ def intrinsic_reward(
             return None
         case CuriosityBonus():
             assert config.novelty is not None
-            space, size = environment.observation_space, environment.observation_size
+            space, size = environment.given_space, environment.observation_size
             return CheckedBonus(Curiosity(config.memory, config.novelty, space, size, streams))
         case CustomBonus(estimator=estimator, arguments=arguments):
             key, own = "bonus.estimator", (environment, streams["bonus"])
@@ -96,8 +96,8 @@ def intrinsic_reward(
 
 def environment(config: AgentConfig, streams: Streams) -> Environment:
     """The environment that the agent acts in."""
-    limits = config.max_episode_steps, config.environment_arguments
-    made = Environment(config.environment, streams.sequence("environment"), *limits)
+    own = config.max_episode_steps, config.environment_arguments, config.wrappers
+    made = Environment(config.environment, streams.sequence("environment"), *own)
     made.clips_actions = config.ppo.clip_actions
     return made
 

@@ -89,7 +89,8 @@ def fallback_reason(environment: Environment) -> str:
 
 
 def _is_compiled(environment: Environment) -> bool:
-    return type(environment.env.unwrapped) is COMPILED.get(environment.name)
+    plain = type(environment.env.unwrapped) is COMPILED.get(environment.name)
+    return plain and not environment.wrapped
 
 
 def takes_compiled_steps(inner: Any) -> bool:

@@ -1,7 +1,8 @@
 """Curiosity while an episode is played: what the wrappers ask of it, step by step."""
 
 import copy
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import gymnasium
@@ -36,11 +37,13 @@ class Recording:
     beta: float
     unit: float  # see `CuriosityTracker.unit`
     baseline: float  # R_curiosity that is paid with 0
-    visits: np.ndarray  # to each Discrete state so far, [observation]; 0 for Box ones
     observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
     rewards: list[float] = field(default_factory=list)  # extrinsic
     bonus: list[float] = field(default_factory=list)  # R_curiosity
+
+    def __post_init__(self) -> None:
+        self.visits = Counter(state.tobytes() for state in self.observations[1:])
 
     def episode(self, terminated: bool) -> Episode:
         """The finished episode; the log-probabilities of its actions are unknown, NaN."""
@@ -50,13 +53,14 @@ class Recording:
 
     def state_dict(self) -> dict[str, Any]:
         """Each part as one tensor."""
-        return {name: torch.from_numpy(np.array(part)) for name, part in vars(self).items()}
+        parts = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: torch.from_numpy(np.array(part)) for name, part in parts.items()}
 
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
         """From the tensors of `state_dict` as arrays."""
-        beta, unit, baseline, visits, *lists = state.values()
-        return cls(beta.item(), unit.item(), baseline.item(), visits, *map(list, lists))
+        beta, unit, baseline, *lists = state.values()
+        return cls(beta.item(), unit.item(), baseline.item(), *map(list, lists))
 
 
 class CuriosityTracker(Stateful):
@@ -67,7 +71,7 @@ class CuriosityTracker(Stateful):
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
         self.config, self.spaces = config, spaces
         streams = Streams(config.seed)
-        space, size = spaces.observation_space, spaces.observation_size
+        space, size = spaces.given_space, spaces.observation_size
         memory = config.memory if config.relevance else None
         self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
         self.controller = beta_rule(config.beta, streams["beta"])
@@ -93,8 +97,7 @@ class CuriosityTracker(Stateful):
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
         require_within("β", beta, largest=LARGEST_BETA)
         baseline = self.bonus_sum / self.count if self.config.centred and self.count else 0.0
-        visits = np.zeros(len(first))
-        self.recordings[environment] = Recording(beta, self.unit, baseline, visits, [first])
+        self.recordings[environment] = Recording(beta, self.unit, baseline, [first])
 
     def as_recorded(self, action: Any) -> Any:
         """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
@@ -121,8 +124,7 @@ class CuriosityTracker(Stateful):
         if not 0 <= bonus <= 1:
             require_within("the curiosity bonus", bonus, rounding=1e-6)
             bonus = max(bonus, 0.0)
-        if self.spaces.discrete_observations:
-            recording.visits += state
+        recording.visits[state.tobytes()] += 1
         recording.actions.append(action)
         recording.observations.append(state)
         recording.rewards.append(reward)
@@ -154,7 +156,7 @@ class CuriosityTracker(Stateful):
             "observation_size": self.spaces.observation_size,
             "observation_space": type(self.spaces.observation_space).__name__,
             "environments": len(self.recordings),
-            "form": 7,  # of the state itself
+            "form": 8,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class CuriosityMixin(RecordConstructorArgs):
                     f"environment {name_of(env)!r} has {self.mode!r} as metadata['autoreset_mode'],"
                     " but it should be one of gymnasium.vector.AutoresetMode"
                 )
-        self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces), count)
+        self.tracker = CuriosityTracker(config, Spaces(name_of(env), *spaces, in_part=True), count)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the bonus depends on, the unfinished episode included.

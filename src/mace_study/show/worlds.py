@@ -21,6 +21,7 @@ from mace_study.show.curves import (
     style,
 )
 from mace_study.show.pictures import INK, OUTCOMES, wrapped
+from mace_study.show.tables import number
 
 LINE = 0.15  # inches
 SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
@@ -50,6 +51,13 @@ def _best_supported(judged: Judgement) -> tuple[Any, ...]:
     return *verdict, part.difference, part.low, part.high, part.p_holm
 
 
+def difference(value: float, low: float, high: float) -> str:
+    """With its interval, in as many digits as its size asks for."""
+    largest = max(abs(low), abs(high))
+    digits = 0 if largest >= 10 else 1 if largest >= 1 else 3
+    return f"{number(value, digits)} ({number(low, digits)} to {number(high, digits)})"
+
+
 def draw_verdicts(table: pd.DataFrame) -> Figure:
     """A cell per claim and world in the verdict's colour, with its best-supported difference."""
     claims = table.drop_duplicates("claim")
@@ -67,9 +75,8 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         for row in rows:
             left, height = worlds.index(row.world), heights[list(said).index(row.claim)]
             colour, _ = OUTCOMES[row.outcome]
-            ends = (f"{end:.2g}" for end in (row.low, row.high))
             verdict = row.verdict.replace(" (", "\n(")
-            lines = f"{verdict}\n{row.difference:.2g} ({' to '.join(ends)})"
+            lines = f"{verdict}\n{difference(row.difference, row.low, row.high)}"
             area = (
                 (left, left + 0.97),
                 (tops[row.claim] + 0.05,) * 2,

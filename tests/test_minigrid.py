@@ -1,0 +1,180 @@
+"""Wrappers around environments, counts of states of whole numbers, and MiniGrid with both."""
+
+import io
+import runpy
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
+from invented import ROOT
+
+from mace_rl import CuriosityReward, load_agent, settings
+from mace_rl.bonus.novelty import HashedCountNovelty
+from mace_rl.cli import main
+from mace_rl.config.section import ConfigError
+from mace_rl.environments.spaces import Spaces, is_discrete
+from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.verify import repeat
+from mace_rl.training.trainer import Trainer
+
+DOOR = "MiniGrid-DoorKey-5x5-v0"
+IMAGE = "minigrid.wrappers:ImgObsWrapper"
+PIXELS = Box(0, 255, (2, 2, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("space", "counted"),
+    [
+        *((space, True) for space in (Discrete(3), MultiBinary(4), MultiDiscrete([2, 3]), PIXELS)),
+        (Dict({"a": PIXELS, "b": Discrete(4)}), True),
+        (Tuple((Discrete(2), MultiBinary(1))), True),
+        (Box(0, 1, (3,), np.float32), False),
+        (Dict({"a": PIXELS, "b": Box(0, 1, (1,), np.float32)}), False),
+    ],
+)
+def test_what_is_counted(space, counted, run_config, register):
+    class Any(gymnasium.Env):
+        observation_space, action_space = space, Discrete(2)
+
+        def reset(self, **options):
+            super().reset(**options)
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 1.0, False, False, {}
+
+    assert is_discrete(space) == counted
+    name = register("Any-v0", Any, 6)
+    trainer = Trainer(run_config(name, "mace_fixed", 0, episodes=3))
+    list(trainer.run())
+    kind = type(trainer.curiosity.novelty).__name__
+    counts = "CountNovelty" if isinstance(space, Discrete) else "HashedCountNovelty"
+    assert kind == (counts if counted else "DensityNovelty")
+
+
+def test_counts_against_a_dictionary():
+    """Every visit counts 0.9 to the power of its age; asking is not visiting."""
+    rng, seen = np.random.default_rng(0), []
+    novelty = HashedCountNovelty(SimpleNamespace(count_decay=0.9))
+    for episode in range(30):
+        states = rng.integers(0, 3, (20, 2)).astype(np.float32)
+        expected, own = [], {}
+        for state in map(tuple, states.tolist()):
+            own[state] = own.get(state, 0) + 1
+            before = sum(0.9 ** (episode - age) for age, one in seen if one == state)
+            expected.append(1 / (before + own[state]))
+        np.testing.assert_allclose(novelty(states), expected)
+        np.testing.assert_allclose(novelty(states), expected)
+        earlier = {states[0].tobytes(): 2}
+        assert novelty.continued(states[:1], earlier) == pytest.approx(1 / (1 / expected[0] + 2))
+        novelty.observe(states)
+        seen += [(episode, state) for state in map(tuple, states.tolist())]
+        if episode == 15:
+            again = HashedCountNovelty(SimpleNamespace(count_decay=0.9))
+            again.load_state_dict(novelty.state_dict())
+            novelty = again
+    assert len(novelty.known) == 9
+
+
+class Halved(gymnasium.RewardWrapper):
+    """Half the reward, or another share."""
+
+    def __init__(self, env, share=0.5):
+        super().__init__(env)
+        self.share = share
+
+    def reward(self, reward):
+        return self.share * float(reward)
+
+
+def test_wrappers_go_around_the_environment_in_order(run_config):
+    """Also around one that is otherwise played in compiled code."""
+    plain = Trainer(run_config("CartPole-v1", "ppo", 0, episodes=2))
+    around = [
+        "test_minigrid:Halved",
+        {"wrapper": "test_minigrid:Halved", "arguments": {"share": 3}},
+    ]
+    config = run_config("CartPole-v1", "ppo", 0, episodes=2, environment_wrappers=around)
+    wrapped = Trainer(config)
+    first, second = next(plain.run())[0], next(wrapped.run())[0]
+    assert second.length == first.length and second.extrinsic_return == 1.5 * first.length
+    assert wrapped.environment.env.share == 3 and wrapped.environment.env.env.share == 0.5
+    assert config.references()["environment_wrappers.1"] == "test_minigrid:Halved"
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "words"),
+    [
+        ("test_minigrid:Halve", ["has no 'Halve'"]),
+        ("no_module:Halved", ["no Python module 'no_module'"]),
+        ("test_minigrid:Spaces", ["a subclass of gymnasium.core.Env"]),
+        ({"wrapper": "test_minigrid:Halved", "arguments": {"part": 1}}, ["unexpected", "part"]),
+    ],
+)
+def test_a_wrapper_that_cannot_be_made_gets_one_line(wrapper, words):
+    with pytest.raises(ConfigError, match=r"environment_wrappers\.0 has ") as refused:
+        Trainer(settings("CartPole-v1", "ppo", environment_wrappers=[wrapper]))
+    said = str(refused.value)
+    assert all(word in said for word in words) and "\n" not in said
+
+
+def test_a_text_is_refused_with_the_way_out_and_left_out_of_the_wrapper_s_bonus():
+    spaces = Dict({"a": PIXELS, "mission": Text(5)}), Discrete(2)
+    with pytest.raises(ConfigError, match=r"observation\['mission'\] is of Text.*--wrapper"):
+        Spaces("x", *spaces)
+    assert Spaces("x", *spaces, in_part=True).observation_size == 12
+    env = CuriosityReward(gymnasium.make(DOOR))
+    env.reset(seed=0)
+    curious = []
+    for _ in range(400):
+        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+        curious.append(info["curiosity"])
+        if terminated or truncated:
+            env.reset()
+    assert isinstance(observation["mission"], str)
+    assert max(curious) == 1 and min(curious) < 0.2
+    assert isinstance(env.tracker.curiosity.novelty, HashedCountNovelty)
+    other = CuriosityReward(gymnasium.make(DOOR))
+    torch.save(env.state_dict(), buffer := io.BytesIO())
+    buffer.seek(0)
+    other.load_state_dict(torch.load(buffer))
+    assert other.tracker.curiosity.novelty.known == env.tracker.curiosity.novelty.known
+
+
+@pytest.mark.slow
+def test_minigrid_trains_resumes_repeats_and_is_drawn(
+    tmp_path, run_config, kill, checkpoint_every, completes, monkeypatch
+):
+    changes = {"episodes": 6, "max_episode_steps": 40, "environment_wrappers": [IMAGE]}
+    config, folder = run_config(DOOR, "mace_full", 0, **changes), tmp_path / "run"
+    checkpoint_every(1)
+    kill(4, config, folder)
+    (interruption,) = completes(config, folder)["interruptions"]
+    assert interruption["after_episode"] == 3 and interruption["environment_replayed"]
+    assert repeat(FinishedRun(folder, trust=True))[0]
+    with pytest.raises(ConfigError, match=r"environment_wrappers.*give --trust"):
+        load_agent(folder)
+    assert load_agent(folder, trust=True).policy(np.zeros((7, 7, 3), np.uint8)).sample().shape == ()
+    monkeypatch.setattr("sys.argv", ["mace-rl", "watch", str(folder), "--trust", "--seconds", "1"])
+    main()
+    assert (folder / "watch.gif").read_bytes()[:4] == b"GIF8"
+
+
+def test_the_command_line_takes_wrappers(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    words = f"train --env {DOOR} --wrapper {IMAGE} --variant ppo --episodes 1 --max-episode-steps 9"
+    monkeypatch.setattr("sys.argv", ["mace-rl", *words.split(), "--out", str(folder)])
+    main()
+    (around,) = FinishedRun(folder, trust=True).config.environment_wrappers
+    assert around.wrapper == IMAGE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["minigrid_sb3", "minigrid_cleanrl"])
+def test_the_examples_train(name, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [name, "--steps", "600"])
+    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+    assert "mean extrinsic return" in capsys.readouterr().out
