@@ -32,7 +32,8 @@ FIRST, _, *OTHERS = CLAIMS.families.items()  # the second has metrics of its own
 PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict(own)}) for own in ([FIRST], OTHERS))
 LITERAL, ROBUST = CLAIMS.ways
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
-ASKED = [ROOT / "config" / f"{name}.yaml" for name in ("questions", "controls", "planted")]
+ASKED = ("questions", "controls", "planted", "minigrid")
+ASKED = [ROOT / "config" / f"{name}.yaml" for name in ASKED]
 QUESTIONED = read_study([ROOT / "config.yaml", *ASKED]).metrics
 FEW = {"bootstrap_repetitions": 1000}
 QUESTIONED, QUICK = (metrics.model_copy(update=FEW) for metrics in (QUESTIONED, STUDY.metrics))

@@ -29,6 +29,7 @@ WORLDS = {  # what is read over config.yaml
     "distracting": ["questions", "worlds/distracting"],
     "decided": ["plain", "worlds/decided"],
     "initial": ["plain", "worlds/initial"],
+    "minigrid": ["questions", "controls", "minigrid", "worlds/minigrid"],
 }
 TASKS = ("exploration", "controls", "planted", "distracting")  # whose runs lie together
 

@@ -175,7 +175,7 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     words = []
     metric = metric_labels(source.settings).get(part.metric, part.metric).lower()
     if any(other.environments != part.environments for other in parts):
-        words += [name.partition("-")[0] for name in part.environments]
+        words += [name.rpartition("-v")[0] for name in part.environments]
     if any(other.metric != part.metric for other in parts):
         words.append(metric)
     called = source.claims.variants
