@@ -10,7 +10,6 @@ import pytest
 from invented import ROBUST, ROOT
 
 from mace_rl.base import files
-from mace_rl.config.plugins import code_outside
 from mace_study.config.study import Study, read_study
 from tools import kept_runs
 
@@ -52,14 +51,16 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
     shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
     if shallow.stdout.strip() != b"false" or not records:
         pytest.skip("not a git repository with its whole history, or no run is kept yet")
-    states: dict[str, set[tuple[bool, str]]] = {}
+    states: dict[str, set[tuple[tuple, str]]] = {}
     for record in records.values():
         assert not record["code"]["dirty"]
-        # A run's sources are also those of a rule in extras/ that it has.
-        state = bool(code_outside(record["config"])), record["sources"]
+        # A run's sources are also those of the code that it names, such as a rule in extras/.
+        named = ("novelty", "estimator"), ("beta", "rule")
+        names = tuple(record["config"].get(part, {}).get(key) for part, key in named)
+        state = names, record["sources"]
         states.setdefault(record["code"]["commit"], set()).add(state)
     for commit, several in states.items():
-        assert len(several) == len({outside for outside, _ in several})
+        assert len(several) == len({names for names, _ in several})
         then, now = PROTOCOLS[commit[:7]]
         page = subprocess.run([*git, "show", f"{commit}:{then}"], check=True, **told).stdout
         assert page == now.read_bytes()
