@@ -10,6 +10,8 @@ import pytest
 from invented import ROBUST, ROOT
 
 from mace_rl.base import files
+from mace_rl.config.plugins import load
+from mace_rl.config.run import RunConfig
 from mace_study.config.study import Study, read_study
 from tools import kept_runs
 
@@ -64,6 +66,18 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
         then, now = PROTOCOLS[commit[:7]]
         page = subprocess.run([*git, "show", f"{commit}:{then}"], check=True, **told).stdout
         assert page == now.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["tuned", "plain", "published", "tasks"])
+def test_what_is_kept_has_settings_that_still_load(folder) -> None:
+    """Also the names of modules in them: one run of each environment and variant."""
+    records = kept(ROOT / "reference" / "worlds" / folder)
+    for config in {key[:2]: record["config"] for key, record in records.items()}.values():
+        found = RunConfig.model_validate(config)
+        for reference in found.references().values():
+            if ":" in reference and not reference.startswith("HopperBullet"):
+                load(reference, "reference")
 
 
 def kept(archives: Path) -> dict[tuple[str, str, int], dict]:

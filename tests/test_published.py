@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch.nn import functional
 
+from mace_rl import published
 from mace_rl.config.published import PublishedConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.episode import Episode
 from mace_rl.library import settings
+from mace_rl.published import PublishedTrainer
 from mace_rl.runs import run
 from mace_rl.runs.evaluate import evaluate
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.verify import repeat
-from mace_rl.training import published
 from mace_rl.training.experience import Rollout
-from mace_rl.training.published import PublishedTrainer
 from mace_rl.training.trainer import Trainer
 
 CONFIG = Path(__file__).parents[1] / "config"

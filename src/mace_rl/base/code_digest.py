@@ -13,14 +13,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 # A training depends on this package, what is made of its runs on `mace_study`, too.
 PACKAGES = {"training": ["mace_rl"], "everything": ["mace_rl", "mace_study"]}
-KERNELS = (
-    "agent",
-    "beta",
-    "bonus",
-    "environments",
-    "numerics",
-    "training",
-)  # the folders they come from
+# The folders that compiled code comes from.
+KERNELS = ("agent", "beta", "bonus", "environments", "numerics", "training")
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 

@@ -1,4 +1,4 @@
-"""Settings of `mace_rl.training.published`: where the public code departs from the paper's text."""
+"""Settings of `mace_rl.published`: where the public code departs from the paper's text."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ class PublishedConfig(Section):
 # What else a run with this trainer is set to, since it computes nothing else.
 COMPUTED: dict[str, Any] = dict.fromkeys(["bonus", "memory", "novelty", "meta", "pretrained"]) | {
     "engine": "torch",
-    "ppo.network": TorchModule(kind="torch", module="mace_rl.training.published:Actor"),
+    "ppo.network": TorchModule(kind="torch", module="mace_rl.published:Actor"),
     "ppo.hidden_units": [512, 256, 128, 64],
     "ppo.gae_lambda": 1.0,
     "ppo.rollout_steps": 1,

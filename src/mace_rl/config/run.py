@@ -60,9 +60,8 @@ class AgentConfig(Section):
     environment_arguments: EnvironmentArguments = Field(default={})  # for its constructor
     # Around it, the innermost first; None, not [], for what kept runs have no word of.
     environment_wrappers: list[Annotated[WrapperConfig, BeforeValidator(_by_name)]] | None = None
-    trainer: Literal["published"] | None = (
-        None  # None: `training.trainer`; else `training.published`
-    )
+    # None: `mace_rl.training.trainer`; else `mace_rl.published`.
+    trainer: Literal["published"] | None = None
     engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
     ppo: PPOConfig
     published: PublishedConfig | None = None

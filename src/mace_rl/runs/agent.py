@@ -14,6 +14,7 @@ from gymnasium.spaces import Space
 from torch import Tensor
 from torch.distributions import Distribution
 
+from mace_rl import published
 from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
@@ -24,7 +25,6 @@ from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
-from mace_rl.training import published
 from mace_rl.training.factories import actor_critic, environment
 
 

@@ -22,11 +22,11 @@ from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
 from mace_rl.base.rng import Streams
 from mace_rl.config.run import IDENTITY, RunConfig
+from mace_rl.published import PublishedTrainer
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.finished import WAY_OUT, difference_from, finished
 from mace_rl.training import resuming
-from mace_rl.training.published import PublishedTrainer
 from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.training.resuming import seeded
 from mace_rl.training.rollout import fallback_reason
