@@ -1,6 +1,6 @@
 """The kept verdicts, and the table as a draw, once more by code written from the pages alone.
 
-docs/metrics.md ("The rule") and docs/worlds-protocol.md say what is computed here, config/
+docs/metrics.md ("The rule") and reference/worlds/protocol.md say what is computed here, config/
 which parts and settings. What made the tables is not imported: a mistake would be needed twice.
 """
 

@@ -17,7 +17,7 @@ from tools import kept_runs
 
 # By the commit that runs name: their protocol as it lies there, and where it lies today.
 PROTOCOLS = {
-    "34f838d": ("docs/worlds-protocol.md", ROOT / "docs" / "worlds-protocol.md"),
+    "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
 }
 WORLDS = {  # what is read over config.yaml

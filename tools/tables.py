@@ -5,8 +5,8 @@
 
 The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY, the outputs that
 reference/studies.yaml names, and README.md: tables.md with the pictures that are among these. What
-the worlds of docs/worlds-protocol.md say together comes into results/tables/worlds. Pictures are
-reduced to 256 colours. All is compared with reference/tables. New files are kept there, and
+the worlds of reference/worlds/protocol.md say together comes into results/tables/worlds. Pictures
+are reduced to 256 colours. All is compared with reference/tables. New files are kept there, and
 README.md, which only shows the others, is renewed; with --check both are mistakes. With --report
 only the page of one study is made, and not compared.
 """

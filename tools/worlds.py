@@ -1,4 +1,4 @@
-"""What the worlds of docs/worlds-protocol.md say together, from what Snakemake made in each.
+"""What the worlds of reference/worlds/protocol.md say together, from what Snakemake made in each.
 
     python -m tools.worlds FOLDER      for example results/worlds; `make tables` does it, too
 
@@ -121,7 +121,7 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     frame = order.merge(wide).astype({"paper": int}).map(str)
     note = (
         "Median and central 90 % of each world's seeds. *: unusual, by its place among the seeds"
-        " ([the protocol](../../../docs/worlds-protocol.md#the-table-as-a-draw))."
+        " ([the protocol](../../worlds/protocol.md#the-table-as-a-draw))."
     )
     sections.append(Section("The paper's numbers", note, frame))
     rows = [

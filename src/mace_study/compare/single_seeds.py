@@ -1,7 +1,7 @@
 """The paper's Table 1 as a draw: could it be one seed of each variant in this study?
 
-Both metrics are read by the public code's rules (docs/worlds-protocol.md, "The table as a draw").
-Whatever is asked is exact: over all seeds that could have been drawn.
+Both metrics are read by the public code's rules (reference/worlds/protocol.md, "The table as a
+draw"). Whatever is asked is exact: over all seeds that could have been drawn.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,4 +1,4 @@
-"""Pictures of several studies of the same claims: each a *world* (docs/worlds-protocol.md)."""
+"""Pictures of several studies of the same claims: each a *world* (reference/worlds/protocol.md)."""
 
 import itertools
 from collections.abc import Mapping, Sequence
