@@ -23,7 +23,7 @@ STEPS = 61_440  # of a reading, after a warm-up
 PAIRS = 5
 READ = """
 import sys
-import mace_rl.base.cpu_features
+import tools  # which pins what NumPy and PyTorch compute with, in older commits too
 import torch
 from benchmarks.speed import read_clock, start, warm_up
 torch.set_num_threads(1)
