@@ -20,10 +20,11 @@ COLUMNS = ("section", "env", "contestant", "repeat", "part", "steps", "seconds",
 COLUMNS += ("memory_mb", "note", "machine")
 
 ENVIRONMENTS = CARTPOLE, ACROBOT, HOPPER = "CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"
+MINIGRID = "MiniGrid-DoorKey-8x8-v0"
 VARIANTS = ("ppo", "mace_fixed", "mace_full")
 FIRST_SEED = 1000  # of the measurements; the study reports others
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PACKAGES = "torch numpy numba gymnasium pybullet stable-baselines3"
+PACKAGES = "torch numpy numba gymnasium minigrid pybullet stable-baselines3"
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,8 @@ class Scale:
 FULL = Scale(
     folder=ROOT / "benchmarks",
     repeats=5,
-    steps={CARTPOLE: 204800, ACROBOT: 204800, HOPPER: 65536},
-    peer_steps={CARTPOLE: 30720, ACROBOT: 30720, HOPPER: 16384},
+    steps={CARTPOLE: 204800, ACROBOT: 204800, HOPPER: 65536, MINIGRID: 20480},
+    peer_steps={CARTPOLE: 30720, ACROBOT: 30720, HOPPER: 16384, MINIGRID: 20480},
     growth_episodes=400,
     workflow_episodes=200,
     workflow_seeds=2,
@@ -53,8 +54,8 @@ FULL = Scale(
 QUICK = Scale(
     folder=ROOT / "benchmarks" / "quick",
     repeats=1,
-    steps=dict.fromkeys(ENVIRONMENTS, 6144),
-    peer_steps=dict.fromkeys(ENVIRONMENTS, 2048),
+    steps=dict.fromkeys([*ENVIRONMENTS, MINIGRID], 6144),
+    peer_steps=dict.fromkeys([*ENVIRONMENTS, MINIGRID], 2048),
     growth_episodes=50,
     workflow_episodes=5,
     workflow_seeds=1,

@@ -9,9 +9,9 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from benchmarks import breakdown, purejaxrl, speed, workflow
+from benchmarks import breakdown, minigrid, purejaxrl, speed, workflow
 from benchmarks.bounds import BOUNDS
-from benchmarks.measuring import ENVIRONMENTS, FILE
+from benchmarks.measuring import ENVIRONMENTS, FILE, MINIGRID
 from mace_rl.base.files import write_atomically
 
 HEAD = """# Measurements
@@ -118,6 +118,17 @@ def growth_section(rows: pd.DataFrame) -> str:
     return markdown(pd.DataFrame(lines, columns=["environment", *columns]), columns)
 
 
+def minigrid_section(rows: pd.DataFrame) -> str:
+    """µs per step of everybody, and how many times the environment's alone within each repeat."""
+    step, lines = 1e6 / rates(rows)[MINIGRID], []
+    for contestant in minigrid.CONTESTANTS:
+        ratio = step[contestant] / step["environment"]
+        cells = [median_and_range(step[contestant], ".0f"), median_and_range(ratio, ".2f")]
+        lines.append([speed.LABELS[contestant], *cells])
+    columns = ["µs of CPU time per step", "÷ environment alone"]
+    return markdown(pd.DataFrame(lines, columns=[MINIGRID, *columns]), columns)
+
+
 def workflow_section(rows: pd.DataFrame) -> str:
     """What the small workflow took, and the peak memory of its trainings."""
     runs = rows["part"] == "training"
@@ -132,6 +143,7 @@ SECTIONS = {
     "purejaxrl": ("Beside PureJaxRL", purejaxrl_section),
     "breakdown": ("Where a step's time goes", breakdown_section),
     "growth": ("Growth over a long run of `mace_full`", growth_section),
+    "minigrid": ("MiniGrid", minigrid_section),
     "workflow": ("The whole workflow", workflow_section),
 }
 

@@ -133,7 +133,8 @@ class Environment(Spaces):
         """A new array, [actions]: the action as the environment gets it, of its space."""
         space: Any = self.action_space
         given = action.clip(space.low, space.high) if self.clips_actions else action.copy()
-        return given if np.can_cast(given.dtype, space.dtype) else given.astype(space.dtype)
+        same = given.dtype == space.dtype or np.can_cast(given.dtype, space.dtype)
+        return given if same else given.astype(space.dtype)
 
     def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
         """Observation, reward and flags, checked; `action` is the `number`th of an episode."""

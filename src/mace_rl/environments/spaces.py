@@ -12,6 +12,7 @@ from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
 MOST_NUMBERS = 10**4  # in an observation or an action: each is a row of networks and memory
 FLAT = (Box, Discrete, MultiBinary, MultiDiscrete)  # spaces that are vectors, or become some
+COMPOSITE = (Dict, Tuple, MultiDiscrete)  # spaces that `flatten` makes vectors of
 NUMBERS = "biuf"  # NumPy's kinds of numbers
 
 
@@ -34,6 +35,7 @@ class Spaces:
         require_flat(name, observations)
         require_size(name, observations)
         self.given_space = observations  # of what `encode` gets
+        self.composite = observations if isinstance(observations, COMPOSITE) else None
         if not isinstance(observations, Box | Discrete):
             observations = gymnasium.spaces.flatten_space(observations)
         box = isinstance(actions, Box) and len(actions.shape) == 1
@@ -56,7 +58,7 @@ class Spaces:
         step: the step that returned it, for messages; 0 is the reset. Raises `ConfigError` unless
         it is of the space, and `NonFiniteError` for numbers that are not finite or too large.
         """
-        space, given = self.observation_space, _array(observation, self.given_space)
+        space, given = self.observation_space, _array(observation, self.composite)
         if isinstance(space, Discrete):
             number = _only(given)
             place = -1 if number is None or number % 1 else int(number) - int(space.start)
@@ -66,7 +68,9 @@ class Spaces:
                 return vector
         elif given.size == self.observation_size and given.dtype.kind in NUMBERS:
             vector = given.ravel()
-            if vector.dtype != np.float32:
+            if vector.dtype.kind != "f":
+                vector = vector.astype(np.float32)
+            elif vector.dtype != np.float32:
                 with np.errstate(over="ignore"):  # what becomes infinite is found in the next line
                     vector = vector.astype(np.float32)
             if not all_below(vector, TOO_LARGE):
@@ -79,7 +83,7 @@ class Spaces:
 
     def number(self, what: str, value: Any, step: int) -> float:
         """A reward or flag of a step, counted from 1; `ConfigError` unless it is one number."""
-        if type(value) is float or type(value) is bool:
+        if type(value) in (float, bool, int) and abs(value) < TOO_LARGE:
             return value
         if (found := _only(_array(value))) is None:
             raise ConfigError(
@@ -140,14 +144,16 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
         )
 
 
-def _array(given: Any, space: gymnasium.Space[Any] | None = None) -> np.ndarray:
-    """As an array, a vector for a Dict, Tuple or MultiDiscrete; without numbers if it is none."""
+def _array(given: Any, composite: gymnasium.Space[Any] | None = None) -> np.ndarray:
+    """As an array, a vector for a composite space; without numbers if it is none."""
+    if type(given) is np.ndarray and composite is None:
+        return given
     # NumPy, PyTorch and Gymnasium raise these if it is.
     with suppress(AttributeError, LookupError, TypeError, ValueError, RuntimeError):
-        if not isinstance(space, Dict | Tuple | MultiDiscrete):
+        if composite is None:
             return np.asarray(given)
-        if _has_parts(given, space):
-            return np.asarray(gymnasium.spaces.flatten(space, given))
+        if _has_parts(given, composite):
+            return np.asarray(gymnasium.spaces.flatten(composite, given))
     return np.empty((), object)
 
 
