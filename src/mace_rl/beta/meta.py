@@ -2,8 +2,9 @@
 
 The paper (supplement): its input is "a sequence of the agent's experiences from the preceding
 episode, including states, actions, and rewards", its output "determines the β for the next
-episode", and it "is trained with its own optimizer". It names no loss. Ours is the credit of β
-(`beta.credit`): what a little more of it did to the extrinsic return.
+episode", and it "is trained with its own optimizer". It names no loss. Ours, -c o + λ o² / 2, is in
+`beta.network`: o is the output, c the credit of its β (`beta.credit`), what a little more of it did
+to the extrinsic return.
 """
 
 import math

@@ -10,11 +10,15 @@ from gymnasium.spaces import Discrete
 
 from mace_rl.base.rng import Streams
 from mace_rl.base.state import Stateful
+from mace_rl.bonus.counts import CountNovelty, HashedCountNovelty
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.bonus.memory import EpisodicMemory
-from mace_rl.bonus.novelty import novelty
+from mace_rl.bonus.novelty import DensityNovelty, Novelty
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
+from mace_rl.config.plugins import make
+from mace_rl.config.section import ConfigError
 from mace_rl.environments.episode import Episode
+from mace_rl.environments.spaces import is_discrete
 from mace_rl.numerics.arrays import mean, variance
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.finite import numbers
@@ -71,7 +75,7 @@ class Curiosity(Stateful, IntrinsicReward):
         self.normaliser = RunningNormaliser(observation_size)
         self.steps = 0  # remembered or not
         self.discrete = isinstance(observation_space, Discrete)
-        self.novelty = novelty(novelty_config, observation_space, self.normaliser, streams)
+        self.novelty = novelty_of(novelty_config, observation_space, self.normaliser, streams)
 
     def bonus(self, episode: Episode) -> Bonus:
         """R_curiosity of each step: novelty × relevance of the state it led to."""
@@ -132,3 +136,26 @@ class Curiosity(Stateful, IntrinsicReward):
         """See `Stateful`."""
         super().load_state_dict(state)
         self._build_index()
+
+
+def novelty_of(
+    config: NoveltyConfig, space: Space[Any], normaliser: RunningNormaliser, streams: Streams
+) -> Novelty:
+    """The novelty that the settings ask for, of observations in `space`, before they are flat."""
+    size, kind = len(normaliser.mean), config.kind
+    if kind == "auto":
+        kind = "counts" if is_discrete(space) else "density"
+    match kind:
+        case "counts" if isinstance(space, Discrete):
+            return CountNovelty(config, size)
+        case "counts" if is_discrete(space):
+            return HashedCountNovelty(config)
+        case "density" if not isinstance(space, Discrete):
+            return DensityNovelty(config, normaliser, streams)
+        case "custom" if config.estimator is not None:
+            key, given = "novelty.estimator", (size, streams["novelty"])
+            return make(config.estimator, key, Novelty, False, *given, **config.arguments)
+    raise ConfigError(
+        f"novelty.kind is {kind!r}, but the observations are {space}: 'counts' is for Discrete"
+        " ones and whole numbers, 'density' for all but Discrete"
+    )

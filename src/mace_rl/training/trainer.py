@@ -7,7 +7,9 @@ advantages of each episode's reward and of its curiosity bonus, and lets it beco
 (`collect`, `advantages`). Then what sets β learns (`meta_update`), and PPO updates the policy with
 both advantages, weighed by β (`ppo_update`). What they use is in the folders `agent` (PPO), `bonus`
 (novelty, episodic memory), `beta` (schedules, meta network) and `environments`; `factories` makes
-it as the settings ask for. `experience` has the place where β meets the advantage.
+it as the settings ask for. Where β meets the advantage: `experience.weigh`. PPO's clipped loss:
+`agent.torch_learner`; its gradient in compiled code: `agent.compiled_learner`. The meta network's
+loss: `beta.network`.
 """
 
 from collections.abc import Iterator
