@@ -55,21 +55,21 @@ def seeds_of(study: dict, env: str) -> list[int]:
 
 
 def asked(study: dict) -> list[dict]:
-    """The parts of all claims for which a study has the runs, each by its `NAMES`."""
+    """The parts of all families for which a study has the runs, each by its `NAMES`."""
     found = []
     for family, content in CLAIMS["families"].items():
+        parts = []
         for (claim, said), way in itertools.product(content["claims"].items(), CLAIMS["ways"]):
-            parts = []
             for part in said["parts"].get(way, []):
                 envs, own = part["environments"], [part["metric"], part["variant"]]
                 each = [envs] if part.get("together") else [[env] for env in envs]
                 for where, over in itertools.product(each, part["over"] or [None]):
                     names = [family, claim, way, where, *own, over]
                     parts.append(dict(zip(NAMES, names, strict=True)))
-            variants = {part[key] for part in parts for key in ("variant", "baseline")} - {None}
-            where = {env for part in parts for env in part["environments"]}
-            if variants <= {*study["variants"]} and where <= {*study["environments"]}:
-                found += parts
+        variants = {part[key] for part in parts for key in ("variant", "baseline")} - {None}
+        where = {env for part in parts for env in part["environments"]}
+        if variants <= {*study["variants"]} and where <= {*study["environments"]}:
+            found += parts
     return found
 
 
