@@ -297,6 +297,16 @@ def test_the_guard_s_ratios_are_of_pairs(monkeypatch):
     )
 
 
+def test_the_guard_counts_between_two_numbers_of_steps(monkeypatch):
+    def run_in(tree, command, **more):
+        steps = int(command[-1]) + 3  # whole episodes
+        count = f"==7== I   refs:      {10**9 + 1234 * steps:,}" * (command[0] == "valgrind")
+        return subprocess.CompletedProcess(command, 0, f"{steps}\n", count)
+
+    monkeypatch.setattr(guard, "run_in", run_in)
+    assert guard.instructions(ROOT, "ppo", CARTPOLE) == 1234
+
+
 @pytest.mark.slow
 def test_the_guard_reads_a_training_of_a_tree():
     assert 1 < guard.microseconds(ROOT, "ppo", CARTPOLE, 1000, 2048) < 10_000
