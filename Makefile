@@ -82,8 +82,8 @@ archive: setup ## the committed tree with checksums as dist/mace-rl-VERSION.tar,
 	@$(IN_VENV) tools.deposit
 
 lint: setup ## check style, types and workflow
-	@$(IN_VENV) ruff check .
-	$(IN_VENV) ruff format --check .
+	@$(IN_VENV) ruff check --no-cache . # an import's place depends on files that a cache does not look at
+	$(IN_VENV) ruff format --no-cache --check .
 	$(IN_VENV) mypy
 	$(IN_VENV) snakefmt --check Snakefile workflow
 	$(IN_VENV) tools.lint_workflow

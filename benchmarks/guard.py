@@ -83,7 +83,7 @@ def run_in(tree: Path, command: list[str], **more: str) -> subprocess.CompletedP
     environment = os.environ | changes
     run = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
     if run.returncode:
-        sys.exit(f"guard: {tree}: {command[-4:]} ended with {run.stderr.strip()[-300:]}")
+        sys.exit(f"guard: {tree}: {' '.join(command[-4:])} ended with {run.stderr.strip()[-300:]}")
     return run
 
 
@@ -129,8 +129,9 @@ def main() -> None:
     )
     which = "a commit (default: the last, or the one before)"
     parser.add_argument("revision", nargs="?", help=which)
-    parser.add_argument("--pairs", type=int, default=PAIRS, help="default: %(default)s")
-    parser.add_argument("--count", action="store_true", help="instructions, by valgrind")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--pairs", type=int, default=PAIRS, help="default: %(default)s")
+    how.add_argument("--count", action="store_true", help="instructions, by valgrind")
     arguments = parser.parse_args()
     if arguments.count and not shutil.which("valgrind"):
         parser.error("--count needs valgrind (Debian, Ubuntu: apt install valgrind)")

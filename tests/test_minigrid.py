@@ -10,9 +10,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
 from invented import ROOT
-from mace_rl.bonus.counts import HashedCountNovelty
 
 from mace_rl import CuriosityReward, load_agent, settings
+from mace_rl.bonus.counts import HashedCountNovelty
 from mace_rl.cli import main
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.spaces import Spaces, is_discrete

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from mace_rl.bonus.counts import CountNovelty
 from scipy.spatial.distance import cdist
 from shared import Twin
 
 from mace_rl.base.rng import Streams
+from mace_rl.bonus.counts import CountNovelty
 from mace_rl.bonus.density import DensityEstimator
 from mace_rl.bonus.novelty import DensityNovelty
 from mace_rl.config.bonus import NoveltyConfig

@@ -14,8 +14,8 @@ import yaml
 from PIL import Image
 from shared import ROOT, Bonanza, message
 
-from benchmarks import bounds, breakdown, guard, purejaxrl
-from benchmarks.measuring import CARTPOLE, HOPPER
+from benchmarks import bounds, breakdown, guard, page, purejaxrl
+from benchmarks.measuring import CARTPOLE, FILE, HOPPER
 from mace_rl.runs import run
 from mace_study.config.study import read_study
 from tools import kept_runs, random_return, tables
@@ -276,6 +276,13 @@ def test_purejaxrl_trains():
     assert reading["steps"] == 1024
     assert 0 < reading["cpu_seconds"] < 60 and reading["seconds"] > 0
     assert reading["note"].startswith("jax 0.10.2, jaxlib 0.10.2, flax ")
+
+
+def test_the_page_of_measurements_is_what_they_say(tmp_path):
+    """Every section of it."""
+    kept = ROOT / "benchmarks"
+    shutil.copy(kept / FILE, tmp_path)
+    assert page.write(tmp_path).read_text() == (kept / "README.md").read_text()
 
 
 def test_the_guard_s_ratios_are_of_pairs(monkeypatch):
