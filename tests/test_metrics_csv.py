@@ -12,6 +12,7 @@ from mace_rl.config.section import ConfigError, check
 from mace_rl.training.records import RecordError
 from mace_study.config.metrics import GOALS, MetricsConfig
 from mace_study.measure import metrics as m
+from mace_study.measure.metrics_csv import metrics_of_run, metrics_table, read_metrics
 
 ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "env": "CartPole-v1",
@@ -46,12 +47,12 @@ def runs():
 
 
 def table(settings=CONFIG):
-    return m.metrics_table(runs(), settings)
+    return metrics_table(runs(), settings)
 
 
 def test_a_row_holds_each_metric_under_its_name():
     returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
-    row = m.metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    row = metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
     assert row == ROW
     assert list(row) == COLUMNS
 
@@ -96,7 +97,7 @@ def test_a_damaged_metrics_file_is_refused(damage, tmp_path):
     spoil(lines)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordError, match=named) as refusal:
-        m.read_metrics(path, WANTED, CONFIG)
+        read_metrics(path, WANTED, CONFIG)
     assert str(path) in str(refusal.value)
 
 
@@ -131,10 +132,10 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
         first = next((t for t, value in enumerate(returns, start=1) if value > 0), None)
         assert tuple(row) == (first or 400, min(returns), first is None)
     result.to_csv(tmp_path / "metrics.csv", index=False)
-    read = m.read_metrics(tmp_path / "metrics.csv", WANTED, settings)
+    read = read_metrics(tmp_path / "metrics.csv", WANTED, settings)
     pd.testing.assert_frame_equal(read, result, check_exact=True)
     with pytest.raises(RecordError, match="line 1: the column 'positive'"):
-        m.read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
+        read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
 
 
 NOT_FINITE = "is nan, but should be a finite number"

@@ -14,7 +14,7 @@ from shared import ROOT, VARIANTS, finish, provenance_of
 from mace_rl.training.records import EpisodeRecord, RunKey, as_columns
 from mace_study.compare.summary import split, summary
 from mace_study.config.study import read_study
-from mace_study.measure.metrics import metrics_table
+from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import curves
 from mace_study.show.latex import table1_latex
 

@@ -7,7 +7,7 @@ from invented import CLAIMS, STUDY, frame
 
 from mace_study.compare import readings as r
 from mace_study.compare.statistics import logrank
-from mace_study.measure.metrics import metrics_table
+from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import tables
 from mace_study.show.curves import plot_style
 from mace_study.show.markdown import markdown

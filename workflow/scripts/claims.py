@@ -11,7 +11,7 @@ from mace_study.compare import ledger, verdicts
 from mace_study.compare.claims_config import parse_claims
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.betas import betas_columns
-from mace_study.measure.metrics import read_metrics
+from mace_study.measure.metrics_csv import read_metrics
 from mace_study.show import markdown, sections
 
 with job(snakemake):

@@ -6,7 +6,7 @@ from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import read_runs
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.betas import betas_table
-from mace_study.measure.metrics import metrics_table
+from mace_study.measure.metrics_csv import metrics_table
 
 with job(snakemake):
     settings = MetricsConfig.model_validate(snakemake.params.settings)

@@ -8,7 +8,7 @@ from mace_study.compare.claims_config import parse_claims
 from mace_study.compare.comparisons import comparisons
 from mace_study.compare.summary import split, summary
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.metrics import read_metrics
+from mace_study.measure.metrics_csv import read_metrics
 from mace_study.show.latex import table1_latex
 
 with job(snakemake):

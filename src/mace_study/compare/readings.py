@@ -15,7 +15,8 @@ from mace_study.compare.claims_config import Table1Config
 from mace_study.compare.statistics import logrank
 from mace_study.compare.summary import summary
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.metrics import Metric, all_metrics, metrics_table
+from mace_study.measure.metrics import Metric, all_metrics
+from mace_study.measure.metrics_csv import metrics_table
 
 PAPER, RUNS, SHUFFLED = "paper", "runs", "shuffled"
 COLUMNS = ["env", "kind", "reading", "source", "variant", "mean", "low", "high", "seeds"]

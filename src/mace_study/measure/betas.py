@@ -40,7 +40,8 @@ def betas_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) 
 
     rows = []
     for run, frame in runs.items():
-        beta, curve = frame["beta"].to_numpy(), metrics.learning_curve(frame, run[0], settings)
+        beta, returns = frame["beta"].to_numpy(), frame["extrinsic_return"].to_numpy()
+        curve = metrics.learning_curve(returns, run[0], settings)
         end = metrics.final_return(beta, settings.final_fraction)
         found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
         found += stagnation_correlations(curve, beta) if settings.reference_return else []

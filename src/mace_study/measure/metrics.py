@@ -1,28 +1,21 @@
-"""What is measured on one run, and metrics.csv: how well it ends, and how soon (docs/metrics.md).
+"""What is measured on one run: how well it ends, and how soon (docs/metrics.md).
 
 A metric is a pure function of a `LearningCurve`. A run that never attains a metric in episodes
 counts with E, its number of episodes, and is flagged as censored: E is then a lower bound.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import zip_longest
-from numbers import Real
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mace_rl.config.plugins import load
 from mace_rl.config.section import ConfigError
-from mace_rl.training.records import RecordError, RunKey, read_table
 from mace_study.config.metrics import MetricsConfig
-
-if TYPE_CHECKING:  # planning the workflow imports this module, without pandas
-    import pandas as pd
 
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
@@ -308,75 +301,12 @@ def metrics_columns(metrics: Sequence[Metric]) -> dict[str, type]:
     return run | values | {metric.flag: int for metric in metrics if metric.unit == "episodes"}
 
 
-def metrics_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) -> "pd.DataFrame":
-    """One row of `metrics_columns` per run, in the order of `runs`."""
-    import pandas as pd
-
-    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
-    _check_attained("the table of metrics", table, all_metrics(settings))
-    return table
-
-
-def metrics_of_run(
-    frame: "pd.DataFrame", run: RunKey, settings: MetricsConfig
-) -> dict[str, str | int | float]:
-    """The row of metrics.csv of one run, from its records."""
-    environment, variant, seed = run
-    curve = learning_curve(frame, environment, settings)
-    row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
-    row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
-    metrics = all_metrics(settings)
-    for metric in metrics:
-        value = metric.function(curve)
-        if metric.unit == "episodes" and isinstance(value, Attained):
-            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
-        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
-            row[metric.name] = float(value)
-        else:
-            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
-            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
-    return {name: row[name] for name in metrics_columns(metrics)}
-
-
-def learning_curve(
-    frame: "pd.DataFrame", environment: str, settings: MetricsConfig
-) -> LearningCurve:
-    """What the metrics see of the run with these records (`read_episodes`)."""
-    returns = frame["extrinsic_return"].to_numpy()
+def learning_curve(returns: np.ndarray, environment: str, settings: MetricsConfig) -> LearningCurve:
+    """What the metrics see of a run with these extrinsic returns, float64 [E]."""
     final = final_return(returns, settings.final_fraction)
     random = settings.random_return_in(environment)
     goals = [goal[environment] if goal else math.nan for goal in settings.goals]
     return LearningCurve(returns, final, random, settings, *goals)
-
-
-def read_metrics(
-    path: str | Path, runs: Sequence[Sequence[str | int]], settings: MetricsConfig
-) -> "pd.DataFrame":
-    """Read metrics.csv; `RecordError` unless it has a possible row for each of `runs`, in order.
-
-    runs: of each its environment, variant, seed and number of episodes.
-    """
-    metrics = all_metrics(settings)
-    table = read_table(path, metrics_columns(metrics))
-    found = table[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
-    for line, (run, right) in enumerate(zip_longest(found, map(tuple, runs)), start=2):
-        if run != right:
-            raise RecordError(f"{path}: line {line}: the run {run} stands where {right} belongs")
-    _check_attained(str(path), table, metrics)
-    return table
-
-
-def _check_attained(origin: str, table: "pd.DataFrame", metrics: Sequence[Metric]) -> None:
-    """Refuse episodes outside of training, and flags that contradict them."""
-    for metric in (metric for metric in metrics if metric.unit == "episodes"):
-        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
-        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
-        if not right.all():
-            row = int(np.argmin(right))
-            raise RecordError(
-                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
-                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
-            )
 
 
 def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:

@@ -1,0 +1,79 @@
+"""metrics.csv: every metric of every run of a study, made and read again."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from mace_rl.config.section import ConfigError
+from mace_rl.training.records import RecordError, RunKey, read_table
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.metrics import (
+    Attained,
+    Metric,
+    all_metrics,
+    learning_curve,
+    metrics_columns,
+)
+
+
+def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
+    """One row of `metrics_columns` per run, in the order of `runs`."""
+    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
+    _check_attained("the table of metrics", table, all_metrics(settings))
+    return table
+
+
+def metrics_of_run(
+    frame: pd.DataFrame, run: RunKey, settings: MetricsConfig
+) -> dict[str, str | int | float]:
+    """The row of metrics.csv of one run, from its records."""
+    environment, variant, seed = run
+    curve = learning_curve(frame["extrinsic_return"].to_numpy(), environment, settings)
+    row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
+    row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
+    metrics = all_metrics(settings)
+    for metric in metrics:
+        value = metric.function(curve)
+        if metric.unit == "episodes" and isinstance(value, Attained):
+            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
+        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
+            row[metric.name] = float(value)
+        else:
+            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
+            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
+    return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def read_metrics(
+    path: str | Path, runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> pd.DataFrame:
+    """Read metrics.csv; `RecordError` unless it has a possible row for each of `runs`, in order.
+
+    runs: of each its environment, variant, seed and number of episodes.
+    """
+    metrics = all_metrics(settings)
+    table = read_table(path, metrics_columns(metrics))
+    found = table[["env", "variant", "seed", "episodes"]].itertuples(index=False, name=None)
+    for line, (run, right) in enumerate(zip_longest(found, map(tuple, runs)), start=2):
+        if run != right:
+            raise RecordError(f"{path}: line {line}: the run {run} stands where {right} belongs")
+    _check_attained(str(path), table, metrics)
+    return table
+
+
+def _check_attained(origin: str, table: pd.DataFrame, metrics: Sequence[Metric]) -> None:
+    """Refuse episodes outside of training, and flags that contradict them."""
+    for metric in (metric for metric in metrics if metric.unit == "episodes"):
+        episode, flag, last = table[metric.name], table[metric.flag], table["episodes"]
+        right = episode.between(1, last) & flag.isin((0, 1)) & ((flag == 0) | (episode == last))
+        if not right.all():
+            row = int(np.argmin(right))
+            raise RecordError(
+                f"{origin}: line {row + 2}: {metric.name} is {episode[row]} of"
+                f" {last[row]} episodes with {metric.flag} = {flag[row]}"
+            )
