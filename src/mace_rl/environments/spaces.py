@@ -105,7 +105,7 @@ def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> Non
         for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
             require_flat(name, part, f"{entry}[{key!r}]")
     elif not isinstance(space, FLAT):
-        what = f"the observation{entry} is of {short_repr(space)}"
+        what = f"the observation{entry} is of {type(space).__name__}"
         raise ConfigError(
             f"environment {name!r}: {what}, and not so many numbers at every step; name a wrapper "
             "that leaves it out, such as gymnasium.wrappers:FilterObservation, or makes numbers of "
