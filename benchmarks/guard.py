@@ -21,6 +21,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.measuring import ACROBOT, CARTPOLE, FIRST_SEED, ROOT, THREADS
+from benchmarks.speed import WARM_UP_STEPS
 
 TRAININGS = [(env, who) for env in (CARTPOLE, ACROBOT) for who in ("ppo", "mace_full")]
 STEPS = 61_440  # of a reading, after a warm-up
@@ -29,10 +30,10 @@ READ = """
 import sys
 import tools  # which pins what NumPy and PyTorch compute with, in older commits too
 import torch
-from benchmarks.speed import read_clock, start, warm_up
+from benchmarks.speed import read_clock, start
 torch.set_num_threads(1)
-who, env, seed, steps = *sys.argv[1:3], *map(int, sys.argv[3:])
-warm_up(who, env, seed)
+who, env, seed, steps, warm_up = *sys.argv[1:3], *map(int, sys.argv[3:])
+read_clock(start(who, env, seed + 10**6, warm_up), warm_up)
 found = read_clock(start(who, env, seed, steps), steps)
 print(1e6 * found["cpu_seconds"] / found["steps"])
 """
@@ -55,7 +56,8 @@ AVX2 = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
 
 def microseconds(tree: Path, who: str, env: str, seed: int, steps: int) -> float:
     """CPU time a step of a training by the code in `tree`, in a process of its own."""
-    command = [sys.executable, "-c", READ, who, env, str(seed), str(steps)]
+    numbers = map(str, (seed, steps, WARM_UP_STEPS))
+    command = [sys.executable, "-c", READ, who, env, *numbers]
     return float(run_in(tree, command).stdout.split()[-1])
 
 
