@@ -1,1 +1,1 @@
-"""Bonuses and rules for β that no study here uses, loaded as a user's own: docs/extending.md."""
+"""Bonuses and rules for β beside the method, loaded as a user's own: docs/extending.md."""

@@ -7,7 +7,7 @@ import pytest
 from shared import ROOT, environment_of, finish
 
 from mace_rl.base.rng import Streams
-from mace_rl.beta.controller import BetaGradient
+from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit
@@ -103,7 +103,7 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
     """Its logit, by another sum over all credits; at most 6."""
     settings = {"horizon": 1, "credit_threshold": 0.5} | settings
     controller, gauge, rng = make(200, **settings), Gauge(200), np.random.default_rng(0)
-    network, credits, betas = make().network, [], []
+    network, credits, betas = make().lstm.network, [], []
     gain, known = settings.get("credit_gain", 4.0), -math.log(1.5)
     for n in range(200):
         direction = np.array([1.0, 0.5 * rng.standard_normal()], np.float32)
@@ -119,6 +119,34 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
         if gauge.update(n % 7, 8 / (1 + n), 8) and settings.get("lstm", True):
             known = lstm_logit(gauge.sequence(), network)
     assert len(credits) == 199 and max(betas) > 0.9 and min(betas) < 0.05
+
+
+def test_the_hybrid_adds_what_its_two_parts_say_alone(run_config):
+    """In logits, of which β = 0.4 counts once."""
+
+    def build(kind: str, **changes) -> BetaController:
+        beta, meta = {"kind": kind, "initial": 0.4}, {"horizon": 1, "gain": 0.3}
+        variant = "mace_pretrained" if kind == "pretrained" else "mace_full"
+        changes |= {} if variant == "mace_pretrained" else {"meta": meta}
+        config = run_config("CartPole-v1", variant, 0, episodes=200, beta=beta, **changes)
+        return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
+
+    hybrid, network = build("hybrid"), build("meta")
+    lstm = build("pretrained", pretrained={"credit_gain": 0.0})
+    rng, paths = np.random.default_rng(0), []
+    for n in range(200):
+        gradient = np.array([1.0, 0.5 * rng.standard_normal()], np.float32)
+        effect = BetaGradient(np.array([1.0, 0.0], np.float32), 1.0)
+        credits = [one.learn(gradient, 1.0, effect) for one in (hybrid, network)]
+        assert credits[0] == credits[1]
+        played = Episode(rng.random((9, 4)), rng.integers(2, size=8), np.zeros(8), np.ones(8), True)
+        for one in (hybrid, network, lstm):
+            one.next_episode(played, np.full(8, 1 / (1 + n)))
+        paths.append([one.beta for one in (hybrid, network, lstm)])
+    hybrid_logit, *parts = np.log(np.array(paths).T / (1 - np.array(paths).T))
+    expected = np.clip(sum(parts) - math.log(0.4 / 0.6), -6, 6)
+    np.testing.assert_allclose(hybrid_logit, expected, atol=1e-6)
+    assert all(np.ptp(part) > 0.1 and np.abs(part).max() < 5.9 for part in parts)
 
 
 def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(make):

@@ -163,6 +163,12 @@ def test_what_it_would_ignore_is_refused(changes, words):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("kind", ["pretrained", "hybrid"])
+def test_a_learned_beta_of_ours_is_refused_where_it_is_asked_for(kind):
+    with pytest.raises(ConfigError, match=f"beta.kind is '{kind}'"):
+        PublishedTrainer(make(beta={"kind": kind, "initial": 0.4}))
+
+
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
 def test_plain_ppo_keeps_its_deviation_and_normalises_the_total_return(engine):
     trainer = Trainer(make(BOX, "mace_fixed", "plain", engine=engine))

@@ -32,6 +32,7 @@ from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.config.beta import MetaBeta
 from mace_rl.config.published import PublishedConfig
 from mace_rl.config.run import AgentConfig
+from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
@@ -274,6 +275,10 @@ class PublishedTrainer(Trainer):
     def _make_parts(self, streams: Streams) -> None:
         config, environment = self.config, self.environment
         assert config.published is not None
+        # Not before: a variant of config.yaml that is not asked for may have one of these.
+        if config.beta.kind in ("pretrained", "hybrid"):
+            reason = f"beta.kind is {config.beta.kind!r}, which trainer: published does not know"
+            raise ConfigError(reason)
         self.settings, bonus = config.published, config.beta.kind != "none"
         self.curiosity = Curiosity(config.published, environment) if bonus else None
         self.controller = Meta(environment, streams["meta"]) if bonus else None
@@ -292,7 +297,7 @@ class PublishedTrainer(Trainer):
         if rule.kind == "exponential":
             age = max(0, done - 1) // SCHEDULE_EVERY * SCHEDULE_EVERY
             return max(rule.floor, rule.initial * rule.decay**age)
-        assert isinstance(rule, MetaBeta)  # `RunConfig` refuses others
+        assert isinstance(rule, MetaBeta)  # others are refused
         reaches = self.settings.beta_reaches_reward and done
         return self.controller.printed if reaches else rule.initial
 

@@ -62,10 +62,13 @@ class MetaAdaptation(Stateful, BetaController):
 
     @property
     def beta(self) -> float:
-        """See `BetaController`; from the network as it is now."""
-        if self.source is None:
-            return beta_of(self.initial)
-        return beta_of(self.initial + self.evidence.logit(self.output(self.source)))
+        """See `BetaController`."""
+        return beta_of(self.initial + self.correction)
+
+    @property
+    def correction(self) -> float:
+        """What the network, as it is now, adds to β's logit; 0 before it has read an episode."""
+        return 0.0 if self.source is None else self.evidence.logit(self.output(self.source))
 
     def output(self, source: np.ndarray) -> float:
         """The network's for `self.source`, which it is asked once until it learns."""

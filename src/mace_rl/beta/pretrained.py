@@ -1,4 +1,4 @@
-"""β by an LSTM that was trained beforehand, and the credit of earlier βs: ours, not the paper's."""
+"""β by an LSTM that was trained beforehand, and by what corrects it in a run: ours alone."""
 
 from pathlib import Path
 
@@ -9,6 +9,7 @@ from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator, Judge
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_logit, read_network
+from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.squash import beta_of, logit
 from mace_rl.config.beta import PretrainedConfig
 from mace_rl.environments.episode import Episode
@@ -17,33 +18,48 @@ from mace_rl.numerics.arrays import total
 WEIGHTS = Path(__file__).with_name("weights.npz")  # tools/meta made them
 
 
+class PretrainedLSTM(Stateful):
+    """Reads how the whole training went so far, window by window, and does not learn in a run.
+
+    Its weights come from many short trainings on generated tasks.
+    """
+
+    STATE = ("gauge", "logit")
+
+    def __init__(self, initial: float, episodes: int, answers: bool = True) -> None:
+        """initial: β before the first window closes; episodes: the budget; answers: or it stays."""
+        self.network = read_network(WEIGHTS) if answers else None
+        self.gauge, self.logit = Gauge(episodes), logit(initial)
+
+    def read(self, episode: Episode, bonus: np.ndarray) -> None:
+        """Take in one more episode; at the end of a window `logit` is what it says of β."""
+        closed = self.gauge.update(total(episode.rewards), total(bonus), len(episode))
+        if closed and self.network is not None:
+            self.logit = float(lstm_logit(self.gauge.sequence(), self.network))
+
+
 class PretrainedAdaptation(Stateful, BetaController):
     """The logit of β is the LSTM's answer plus what the credit of earlier βs adds up to.
 
-    The LSTM reads how the whole training went so far, window by window, and does not learn in a
-    run: its weights come from many short trainings on generated tasks. The credit corrects it where
-    the gradients of this training show that more or less β helps.
+    The credit corrects it where the gradients of this training show that more or less β helps.
     """
 
-    STATE = ("gauge", "judge", "integrator", "lstm_part")
+    STATE = ("lstm", "judge", "integrator")
 
     def __init__(self, config: PretrainedConfig, initial: float, episodes: int) -> None:
-        """initial: β before the first window closes; episodes: the budget."""
+        """initial, episodes: of `PretrainedLSTM`."""
         self.learns = config.credit_gain > 0
-        self.network = read_network(WEIGHTS) if config.lstm else None
-        self.gauge, self.judge, self.integrator = Gauge(episodes), Judge(config), Integrator(config)
-        self.lstm_part = logit(initial)
+        self.lstm = PretrainedLSTM(initial, episodes, config.lstm)
+        self.judge, self.integrator = Judge(config), Integrator(config)
 
     @property
     def beta(self) -> float:
         """See `BetaController`."""
-        return beta_of(self.lstm_part + self.integrator.logit)
+        return beta_of(self.lstm.logit + self.integrator.logit)
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
-        closed = self.gauge.update(total(episode.rewards), total(bonus), len(episode))
-        if closed and self.network is not None:
-            self.lstm_part = float(lstm_logit(self.gauge.sequence(), self.network))
+        self.lstm.read(episode, bonus)
 
     def learn(
         self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
@@ -51,5 +67,32 @@ class PretrainedAdaptation(Stateful, BetaController):
         """See `BetaController`."""
         credit = self.judge.judge(gradient, advantage_rms, change)
         if credit is not None:
-            self.integrator.add(credit, self.gauge.progress)
+            self.integrator.add(credit, self.lstm.gauge.progress)
         return credit
+
+
+class HybridAdaptation(Stateful, BetaController):
+    """The logit of β is the pretrained LSTM's answer plus what the paper's network adds to it."""
+
+    STATE = ("lstm", "meta")
+    learns = True
+
+    def __init__(self, meta: MetaAdaptation, initial: float, episodes: int) -> None:
+        """meta: the paper's network; initial, episodes: of `PretrainedLSTM`."""
+        self.lstm, self.meta = PretrainedLSTM(initial, episodes), meta
+
+    @property
+    def beta(self) -> float:
+        """See `BetaController`."""
+        return beta_of(self.lstm.logit + self.meta.correction)
+
+    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
+        """See `BetaController`."""
+        self.lstm.read(episode, bonus)
+        self.meta.next_episode(episode, bonus)
+
+    def learn(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> float | None:
+        """See `BetaController`."""
+        return self.meta.learn(gradient, advantage_rms, change)

@@ -84,6 +84,13 @@ class PretrainedBeta(Section):
     initial: float = Field(gt=0, lt=1)
 
 
+class HybridBeta(Section):
+    """β by the pretrained LSTM, which the paper's network corrects in place of the credit's sum."""
+
+    kind: Literal["hybrid"]
+    initial: float = Field(gt=0, lt=1)
+
+
 class CustomBeta(Section):
     """β from the class `rule`, a `mace_rl.beta.controller.BetaController`.
 
@@ -96,4 +103,4 @@ class CustomBeta(Section):
 
 
 BetaRule = ConstantBeta | ExponentialBeta | CustomBeta
-BetaConfig = NoBonus | MetaBeta | PretrainedBeta | BetaRule
+BetaConfig = NoBonus | MetaBeta | PretrainedBeta | HybridBeta | BetaRule

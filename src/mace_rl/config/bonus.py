@@ -25,7 +25,7 @@ class MemoryConfig(Section):
 
 
 class NoveltyConfig(Section):
-    """Novelty: visitation counts (Discrete observations) or k-NN and density (Box)."""
+    """Novelty: visitation counts (of whole numbers) or k-NN and density (of others)."""
 
     # auto: by the observation space; custom: a `mace_rl.bonus.novelty.Novelty`, made as
     # estimator(size, generator, **arguments).

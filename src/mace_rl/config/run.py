@@ -20,7 +20,8 @@ from mace_rl.config.section import Arguments, Reference, Section, short_repr
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
-BETA_SECTIONS = ("meta", "pretrained")  # used only where beta.kind is this
+# Used only where beta.kind is one of these.
+BETA_SECTIONS = {"meta": ("meta", "hybrid"), "pretrained": ("pretrained",)}
 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -152,7 +153,8 @@ def unused_sections(settings: Any) -> dict[str, str]:
     beta, bonus = value("beta", "kind"), value("bonus", "kind")
     if beta == "none":
         return dict.fromkeys((*BONUS_SECTIONS, *BETA_SECTIONS), "beta.kind 'none'")
-    unused = {kind: f"beta.kind {beta!r}" for kind in BETA_SECTIONS if beta and beta != kind}
+    others = [section for section, kinds in BETA_SECTIONS.items() if beta and beta not in kinds]
+    unused = dict.fromkeys(others, f"beta.kind {beta!r}")
     if value("bonus", "relevance") is False:
         unused["memory"] = "bonus.relevance false"
     if bonus == "custom":

@@ -15,7 +15,7 @@ from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.pretrained import PretrainedAdaptation
+from mace_rl.beta.pretrained import HybridAdaptation, PretrainedAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
@@ -25,6 +25,7 @@ from mace_rl.config.beta import (
     ConstantBeta,
     CustomBeta,
     ExponentialBeta,
+    HybridBeta,
     MetaBeta,
     NoBonus,
     PretrainedBeta,
@@ -53,10 +54,12 @@ def unchecked_controller(
 ) -> BetaController:
     """The same as it is."""
     match config.beta:
-        case MetaBeta(initial=initial):
+        case MetaBeta(initial=initial) | HybridBeta(initial=initial):
             assert config.meta is not None  # `RunConfig` checked that
             own = environment, config.engine, streams["meta"]
-            return MetaAdaptation(config.meta, initial, *own)
+            meta = MetaAdaptation(config.meta, initial, *own)
+            hybrid = isinstance(config.beta, HybridBeta)
+            return HybridAdaptation(meta, initial, config.episodes) if hybrid else meta
         case PretrainedBeta(initial=initial):
             assert config.pretrained is not None
             return PretrainedAdaptation(config.pretrained, initial, config.episodes)

@@ -87,7 +87,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
         actions are Discrete or one-dimensional Box. Episodes have to end, by a time limit or a
         reset: nothing is learned from one that does not.
     beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
-        "exponential", …} or "custom". Not "meta" or "pretrained", which ask for policy gradients.
+        "exponential", …} or "custom". Not "meta", "pretrained" or "hybrid": policy gradients.
     centred: False to pay R_curiosity itself, not what it is beyond its mean.
     relevance: False for novelty alone, without memory; `memory` is then refused.
     memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.

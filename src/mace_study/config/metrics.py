@@ -47,7 +47,7 @@ class MetricsConfig(Section):
     # Which variant is compared with which, [variant, baseline], where the study has both.
     comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
     constants: ConstantsConfig | None = None  # None: there is no picture of them
-    custom: list[Reference] = Field(default=[])  # each a study.measure.metrics.Metric
+    custom: list[Reference] = Field(default=[])  # each a mace_study.measure.metrics.Metric
 
     @model_validator(mode="after")
     def _compared_once(self) -> "MetricsConfig":
