@@ -6,6 +6,7 @@ Only the two lines with `CuriosityReward` and `reward_extrinsic` are about the b
 """
 
 import argparse
+import sys
 
 import mace_rl.base.cpu_features  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
 
@@ -25,6 +26,10 @@ parser.add_argument("--environment", default="MiniGrid-DoorKey-5x5-v0", help="de
 parser.add_argument("--steps", type=int, default=60_000, help="default: %(default)s")
 parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
 arguments = parser.parse_args()
+if arguments.steps < 1:
+    parser.error(f"--steps is {arguments.steps}, but should be at least 1")
+if arguments.environment not in gymnasium.registry:
+    parser.error(f"--environment is {arguments.environment!r}, which nobody has registered")
 ROLLOUT, EPOCHS, MINIBATCH, DISCOUNT, GAE, CLIP = 512, 4, 128, 0.99, 0.95, 0.2
 
 torch.manual_seed(arguments.seed)
@@ -81,5 +86,7 @@ for _ in range(max(1, arguments.steps // ROLLOUT)):
             loss.backward()
             nn.utils.clip_grad_norm_([*actor.parameters(), *critic.parameters()], 0.5)
             optimiser.step()
-last = (returns or [0.0])[-max(1, len(returns) // 5) :]
+if not returns:
+    sys.exit(f"no episode ended in --steps {arguments.steps}: give more")
+last = returns[-max(1, len(returns) // 5) :]
 print(f"mean extrinsic return of the last fifth of {len(returns)} episodes: {np.mean(last):.2f}")

@@ -69,7 +69,9 @@ class ICM(PredictionError):
         if isinstance(space, Discrete):
             actions = np.eye(int(space.n), dtype=np.float32)[episode.actions]
         else:
-            actions = episode.actions.clip(space.low, space.high).astype(np.float32)
+            actions = episode.actions.astype(np.float32)
+            if self.spaces.clips_actions:
+                actions = actions.clip(space.low, space.high).astype(np.float32)
         return np.concatenate([seen[:-1], seen[1:], actions], axis=1)
 
     def errors(self, inputs: np.ndarray) -> np.ndarray:

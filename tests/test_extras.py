@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from shared import ROOT, call, finish, play, refused
+from shared import ROOT, call, environment_of, finish, play, refused
 
+from extras.icm import ICM
 from mace_rl.base.errors import Refusal
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.flag import FlagNovelty
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
+from mace_rl.config.agent import CompiledNetwork
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.finite import NonFiniteError
 from mace_rl.runs import run
 from mace_rl.runs.agent import load_agent
@@ -92,6 +95,16 @@ def test_a_rule_is_told_when_the_policy_changes(run_config):
     assert arm == 1
 
 
+@pytest.mark.parametrize("clips", [True, False])
+def test_icm_sees_actions_as_the_environment_took_them(clips):
+    environment = environment_of("Pendulum-v1")
+    environment.clips_actions = clips
+    states, actions = np.zeros((3, 3), np.float32), np.array([[3.0], [-0.5]], np.float32)
+    episode = Episode(states, actions, np.zeros(2), np.zeros(2), False)
+    found = ICM(environment, np.random.default_rng(0)).inputs(episode)[:, -1]
+    assert found.tolist() == [2.0 if clips else 3.0, -0.5]
+
+
 @pytest.mark.parametrize(
     ("plugin", "arguments", "message"),
     [
@@ -164,13 +177,20 @@ def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
         "variant_settings:\n"
         "  other: {beta: {kind: constant, value: 1.0}, bonus: {kind: custom, arguments: {a: 2}}}\n"
         "  alone: {beta: {kind: constant, value: 1.0}, bonus: {kind: curiosity}}\n"
-        "training: {bonus: {kind: custom, estimator: 'test_extras:Fixed', arguments: {b: 7}}}\n"
+        "  third: {beta: {kind: constant, value: 1.0}, bonus: {estimator: 'test_extras:Fixed2'}}\n"
+        "  back: {beta: {kind: none}, ppo: {network: {kind: mlp}}}\n"
+        "training:\n"
+        "  bonus: {kind: custom, estimator: 'test_extras:Fixed', arguments: {b: 7}}\n"
+        "  ppo: {network: {kind: torch, module: 'torch.nn:Linear'}}\n"
     )
     study = read_study([DEFAULTS, file])
     bonuses = {v: study.run_config("CartPole-v1", v, 0).bonus for v in study.variants}
     assert bonuses["ppo"] is None
     assert bonuses["other"] == CustomBonus(**OWN, arguments={"a": 2, "b": 7})
     assert bonuses["alone"] == CuriosityBonus(kind="curiosity")
+    third = study.run_config("CartPole-v1", "third", 0).bonus
+    assert (third.estimator, third.arguments) == ("test_extras:Fixed2", {})
+    assert study.run_config("CartPole-v1", "back", 0).ppo.network == CompiledNetwork(kind="mlp")
     assert bonuses["mace_fixed"] == CustomBonus(**OWN, arguments={"b": 7})
 
 

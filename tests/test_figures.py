@@ -29,6 +29,8 @@ from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import ConstantsConfig, FigureConfig, MetricsConfig
 from mace_study.show import curves as c
 from mace_study.show.pictures import PICTURES, Source
+from mace_study.show.svg import _thinned
+from mace_study.show.worlds import draw_curves
 
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
 RETURN, BETA = c.quantity("1", METRICS), c.quantity("2", METRICS)
@@ -261,6 +263,38 @@ def test_a_part_that_has_nothing_to_be_told_from_is_called_by_its_metric(ledgers
     answer = replace(answer, ways={ROBUST: alone})
     table = PICTURES["forest"].data(Source({}, [answer], settings, CLAIMS))
     assert list(table["part"]) == ["stagnation_correlation_before"]
+
+
+def test_parts_of_environments_with_like_names_are_told_apart(ledgers, settings):
+    [answer] = [one for one in ledgers[0] if one.claim == "C9"]
+    judged = answer.ways[ROBUST]
+    for names, shown in (
+        (("CartPole-v0", "CartPole-v1"), ("CartPole-v0", "CartPole-v1")),
+        (("a:Maze", "a:Sea-v0"), ("Maze", "Sea")),
+    ):
+        parts = [replace(judged.parts[0], environments=(name,)) for name in names]
+        ways = {ROBUST: replace(judged, parts=tuple(parts))}
+        source = Source({}, [replace(answer, ways=ways)], settings, CLAIMS)
+        assert tuple(PICTURES["forest"].data(source)["part"]) == shown
+
+
+def test_on_the_page_each_variant_keeps_its_own_points():
+    curves = [
+        pd.DataFrame({"env": "E", "variant": name, "episode": np.arange(1, count + 1)})
+        for name, count in (("ppo", 1500), ("mace_full", 1000))
+    ]
+    kept = _thinned(pd.concat(curves)).groupby("variant")["episode"].agg(["size", "max"])
+    assert kept.loc["ppo"].tolist() == [250, 1500] and kept.loc["mace_full"].tolist() == [250, 1000]
+
+
+def test_a_world_may_lack_an_environment():
+    both = c.mean_curves(c.seed_curves(frames(("X-v0", "Y-v0"), 2, 40), RETURN), RETURN, QUESTIONED)
+    worlds = {"one": both[both["env"] == "X-v0"], "two": both}
+    names = {name: name for name in both["variant"].unique()}
+    look = c.plot_style(QUESTIONED, {"columns": 2}, names, dict.fromkeys(names, "k"))
+    panels = {axes.get_title(): axes for axes in draw_curves(worlds, RETURN, look).axes}
+    shown, curve = panels["Y-v0, two"].get_xlim(), both["episode"]
+    assert shown[0] <= curve.min() and shown[1] >= curve.max()
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from invented import averages, curve, noisy
+from invented import QUICK, averages, curve, noisy
 
+from mace_rl.config.section import ConfigError
 from mace_study.measure import metrics as m
 
 
@@ -152,3 +153,21 @@ def test_no_run_is_earlier_than_a_metric_can_be(metric):
     curves = [noisy(seed) for seed in range(20)] + [at_once, risen]
     found = [metric.function(curve(own, random=-1e4, goals=(500.0,))).number for own in curves]
     assert 0 <= min(found) - metric.earliest(50, 400) <= 1
+    assert metric.earliest(50, 20) >= 1 and metric.function(curve(noisy(0)[:20])).number >= 1
+
+
+def late(given: m.LearningCurve) -> float:
+    return float((given.returns >= given.solved).mean())
+
+
+NEEDY = m.Metric("late", "Late", "share", late, "solved_return")
+ODD = m.Metric("odd", "Odd", "share", late, "solved_returns")
+
+
+def test_a_metric_of_the_user_s_own_is_left_out_without_its_goal_too():
+    own = {"custom": ["test_metrics:NEEDY"]}
+    for goal in ({}, {"solved_return": {"CartPole-v1": 475.0}}):
+        found = m.all_metrics(QUICK.model_copy(update=own | {"solved_return": {}} | goal))
+        assert (NEEDY in found) == bool(goal)
+    with pytest.raises(ConfigError, match="needs 'solved_returns', but should need"):
+        m.all_metrics(QUICK.model_copy(update={"custom": ["test_metrics:ODD"]}))

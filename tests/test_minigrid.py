@@ -2,6 +2,7 @@
 
 import io
 import runpy
+from importlib import metadata
 from types import SimpleNamespace
 
 import gymnasium
@@ -17,6 +18,7 @@ from mace_rl.cli import main
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.spaces import Spaces, is_discrete
 from mace_rl.runs.finished import FinishedRun
+from mace_rl.runs.provenance import identity
 from mace_rl.runs.verify import repeat
 from mace_rl.training.trainer import Trainer
 
@@ -77,6 +79,21 @@ def test_counts_against_a_dictionary():
             again.load_state_dict(novelty.state_dict())
             novelty = again
     assert len(novelty.known) == 9
+
+
+def test_whole_numbers_that_float32_does_not_tell_apart_get_a_warning(caplog):
+    novelty = HashedCountNovelty(SimpleNamespace(count_decay=0.9))
+    for size in (2**24 - 1, 2**24, 2**24):
+        novelty.observe(np.array([[size, 0]], np.float32))
+    assert [len(caplog.messages), "2^24" in caplog.text] == [1, True]
+
+
+def test_the_environment_s_package_is_a_part_of_what_a_run_is(run_config):
+    around = [{"wrapper": "gymnasium.wrappers:FilterObservation"}]
+    around[0]["arguments"] = {"filter_keys": ["image", "direction"]}
+    config = run_config(DOOR, "ppo", 0, environment_wrappers=around)
+    own = {"minigrid": metadata.version("minigrid")}
+    assert identity(config)["versions"] == identity(run_config())["versions"] | own
 
 
 class Halved(gymnasium.RewardWrapper):
@@ -178,3 +195,8 @@ def test_the_examples_train(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [name, "--steps", "600"])
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     assert "mean extrinsic return" in capsys.readouterr().out
+    for option, value in (("--steps", "0"), ("--environment", "Nope-v0")):
+        monkeypatch.setattr("sys.argv", [name, option, value])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+        assert option in f"{capsys.readouterr().err}{ended.value}"

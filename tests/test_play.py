@@ -148,6 +148,7 @@ FORMS += [(FOUR, given, [HOT] * 2) for given in ([0, 0], (0, 0), torch.zeros(2).
 FORMS += [(BOX, given, HOT) for given in ([0, 1, 0, 0], np.array(HOT[::-1])[::-1])]
 FORMS += [(PAIR, given, HOT * 2) for given in ([0, 0], np.zeros(2, int), HOT * 2)]
 FORMS += [(Dict(a=MultiDiscrete([2, 2])), {"a": np.array([0, 1])}, [1.0, 0.0, 0.0, 1.0])]
+FORMS += [(Dict(a=FOUR), {"a": 0, "more": 5}, HOT)]  # as training does
 
 
 @pytest.mark.parametrize(("space", "given", "expected"), FORMS)
@@ -159,7 +160,7 @@ WRONG = [
     (FOUR, [3, -2, 0.0, None, "x", (0, {}), [3, 0], [0.5, 0.5, 0, 0], [[0, 1]], np.eye(3), 1j]),
     (BOX, [0, 0.5, np.zeros(3), np.zeros((4, 3)), [np.nan] * 4, [1e300] * 4, (HOT, {})]),
     (CARDS, [(1, 2), (1, 2, 2), (1.0, 2, 1), {1: 0, 2: 0, 0: 0}, ((1, 2, 1), {}), 3, [], ()]),
-    (MIXED, [{}, {"a": 1}, (MIXED.sample(), {}), {**MIXED.sample(), "f": 1}]),
+    (MIXED, [{}, {"a": 1}, (MIXED.sample(), {})]),
     (MIXED, [{**MIXED.sample(), "e": [1, 1]}]),
     (BOX, [np.zeros((0, 4))]),
 ]

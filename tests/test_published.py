@@ -144,12 +144,16 @@ def test_it_resumes_and_repeats_to_the_bit(
     assert first.tolist() == again.tolist()
 
 
+BOOTSTRAPPED = {"bootstrap_at_time_limit": True, "normalise_returns": False}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"engine": "compiled"}, ["engine is 'compiled'", '"torch"']),
         ({"ppo": {"max_gradient_norm": 0.5}}, ["ppo.max_gradient_norm is 0.5", "null"]),
         ({"ppo": {"gae_lambda": 0.9}}, ["gae_lambda: 1.0"]),
+        ({"ppo": BOOTSTRAPPED}, ["bootstrap_at_time_limit is True", "false"]),
         ({"bonus": {"kind": "curiosity"}}, ["bonus is ", "null", "trainer: published"]),
         ({"beta": {"kind": "custom", "rule": "a:B"}}, ["beta.kind is 'custom'"]),
         ({"published": {"bonus_time_reward": True}}, ["'bonus_times_reward'"]),

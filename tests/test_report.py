@@ -181,7 +181,7 @@ def test_a_browser_without_network_shows_all_of_it(made: Path, tmp_path: Path) -
             assert film.n_frames > 2 and film.width == 200
 
 
-def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
+def test_a_study_without_claims_agents_or_bonus_says_so(made: Path, monkeypatch) -> None:
     """From the same files, some left out; made twice, it is the same."""
     study = read_study([made / "config.yaml", made / "tiny.yaml"])
     chosen = ConstantsConfig(learned="mace_full", fixed=["ppo", "mace_fixed"])
@@ -195,7 +195,8 @@ def test_a_study_without_claims_agents_or_bonus_says_so(made: Path) -> None:
     records = [read_record(path) for path in (made / "results").glob("runs/*/*/*/run.json")]
     ppo = {"CartPole-v1": study.run_config("CartPole-v1", "ppo", 0).ppo}
     making = Provenance("a command", {}, ppo, records)
-    films = animations({("CartPole-v1", v): made / v for v in VARIANTS}, study.labels, made)
+    monkeypatch.chdir(made)  # folders as Snakemake has them
+    films = animations({("CartPole-v1", v): Path(v) for v in VARIANTS}, study.labels, made)
     look = plot_style(settings, study.figure.model_dump(), study.labels, study.colours)
     how = CLAIMS, making, films, settings, look
     html = build(data, claims, *how)

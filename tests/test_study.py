@@ -124,6 +124,7 @@ results: LONG  # results, 'xxx, at most 255
 results: ' '  # results, ' ', folder
 results: 'r/{env}'  # results, 'r/{env}', folder
 results: CONFIG/x  # results, CONFIG, is a file
+training: {environment_arguments: {map_name: null}}  # environment_arguments, map_name, FrozenLake
 training: {memory: {capacity: 1000000000000}}  # memory.capacity, less than or equal to 10000000
 """
 

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Discrete, MultiDiscrete, Text, flatdim, flatten
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Text, Tuple, flatdim, flatten
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
@@ -127,6 +127,44 @@ def test_an_episode_that_is_reset_early_is_not_learned_from_if_all_begins_afresh
     for state in states:
         del state["recordings"], state["curiosity"]["memory"]["read"]
     assert archive(states[0]) == archive(states[1])
+
+
+class InParts(TransformObservation):
+    """CartPole's observations as a Dict or Tuple, in which there are a text and a Tuple of none."""
+
+    def __init__(self, form):
+        names, given = ("p", "q", "rest"), gymnasium.make("CartPole-v1")
+        spaces = [Box(-9e9, 9e9, (1,)), Box(-9e9, 9e9, (1,)), Dict(a=Box(-9e9, 9e9, (2,)))]
+        space, convert = Tuple(spaces), self.parts
+        if form is Dict:
+            own = Dict(a=spaces[2]["a"], text=Text(9), more=Tuple([Text(9)]))
+            space = Dict(dict(zip(names, [*spaces[:2], own], strict=True)))
+            convert = self.named
+        super().__init__(given, convert, space)
+
+    def parts(self, numbers):
+        return numbers[:1], numbers[1:2], {"a": numbers[2:]}
+
+    def named(self, numbers):
+        more = {"text": "abc", "more": ("de",)}
+        return {"p": numbers[:1], "q": numbers[1:2], "rest": {"a": numbers[2:]} | more}
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("form", [Dict, Tuple])
+def test_observations_in_parts_earn_what_their_numbers_do(form, mode):
+    makers = [lambda: gymnasium.make("CartPole-v1") for _ in range(2)]
+    flat = VectorCuriosityReward(SyncVectorEnv(makers, autoreset_mode=mode), RANDOM, seed=2)
+    parts = [lambda: InParts(form) for _ in range(2)]
+    made = VectorCuriosityReward(SyncVectorEnv(parts, autoreset_mode=mode), RANDOM, seed=2)
+    for env in (flat, made):
+        env.reset(seed=0)
+    for number in range(300):
+        (_, paid, *ends, _), (_, own, *_) = (step(env, number) for env in (flat, made))
+        np.testing.assert_array_equal(own, paid)
+        if mode is DISABLED and (over := np.logical_or(*ends)).any():
+            for env in (flat, made):
+                env.reset(options={"reset_mask": over})
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
@@ -260,7 +298,7 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
 
 def test_defaults_are_the_study_s(run_config):
     settings = run_config(variant="mace_fixed").settings()
-    config = CuriosityReward(gymnasium.make("CartPole-v1")).tracker.config
+    config = CuriosityReward(gymnasium.make("CartPole-v1"), seed=np.int64(0)).tracker.config
     sections = {name: settings[name] for name in ("memory", "novelty")}
     assert config == CuriosityConfig(beta=0.4, **sections)
     assert config.discount == settings["ppo"]["discount"]
@@ -269,7 +307,10 @@ def test_defaults_are_the_study_s(run_config):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"beta": {"kind": "meta", "initial": 0.4}}, "asks for policy gradients and the budget"),
+        *(
+            ({"beta": {"kind": kind, "initial": 0.4}}, "asks for policy gradients and the budget")
+            for kind in ("meta", "pretrained", "hybrid")
+        ),
         ({"beta": LEARNS}, "beta.rule has 'test_extras:Noted', which learns from policy"),
         ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),
         ({"beta": 10.5}, "beta.value is 10.5, but .* less than or equal to 10"),

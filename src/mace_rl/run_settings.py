@@ -142,11 +142,29 @@ def _resolve(given: RunSettings, environment: str, variant: str, changes: Settin
 
 
 def merge_layers(base: Mapping[str, Any], over: Mapping[str, Any]) -> Settings:
-    """`merge` for settings of runs: `beta` is replaced, and `bonus` if its `kind` changes."""
-    bonuses = [bonus for bonus in (base.get("bonus"), over.get("bonus")) if bonus is not None]
-    kinds = [bonus.get("kind") for bonus in bonuses if isinstance(bonus, Mapping)]
-    same = len(kinds) < 2 or kinds[1] in (kinds[0], None)
-    return merge(base, over, whole={"beta"} if same else {"beta", "bonus"})
+    """`merge` for settings of runs, without what was for another rule, bonus or network.
+
+    `beta` is replaced, `bonus` and `ppo.network` are if their `kind` changes, and `arguments` stay
+    with their `estimator`.
+    """
+
+    def part(settings: Any, *keys: str) -> Any:
+        for key in keys:
+            settings = settings.get(key) if isinstance(settings, Mapping) else None
+        return settings
+
+    def changes(*keys: str) -> bool:
+        old, new = part(base, *keys[:-1]), part(over, *keys)
+        return isinstance(old, Mapping) and new is not None and old.get(keys[-1]) != new
+
+    left_out = [("ppo", "network")] if changes("ppo", "network", "kind") else []
+    left_out += [
+        (section, "arguments") for section in ("bonus", "novelty") if changes(section, "estimator")
+    ]
+    for section, key in left_out:
+        kept = {name: value for name, value in base[section].items() if name != key}
+        base = {**base, section: kept}
+    return merge(base, over, whole={"beta", "bonus"} if changes("bonus", "kind") else {"beta"})
 
 
 def _depth(layer: Any, location: Iterable[Any]) -> int:

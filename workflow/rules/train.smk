@@ -22,6 +22,6 @@ rule train:
     params:
         config=lambda wildcards: run_config(wildcards).settings(),
         code=lambda wildcards: code("train.py", run_config(wildcards)),
-        versions=provenance.versions(),
+        versions=lambda wildcards: provenance.versions(run_config(wildcards)),
     script:
         "../scripts/train.py"

@@ -1,5 +1,6 @@
 """Novelty by visitation counts, for states of whole numbers (paper, supplement)."""
 
+import logging
 from collections import Counter
 from collections.abc import Mapping
 from hashlib import blake2b
@@ -12,6 +13,9 @@ from mace_rl.bonus.novelty import Novelty
 from mace_rl.config.bonus import NoveltyConfig
 
 KEY_BYTES = 16  # of a state among hashed counts
+TOLD_APART = 2.0**24  # below which float32 has every whole number
+
+logger = logging.getLogger(__name__)
 
 
 class CountNovelty(Stateful, Novelty):
@@ -31,11 +35,11 @@ class CountNovelty(Stateful, Novelty):
         return self.continued(states, {})
 
     def continued(self, states: np.ndarray, visits: Mapping[bytes, int]) -> np.ndarray:
-        counts = self.counts.copy()
-        for state, count in visits.items():
-            counts[np.frombuffer(state, np.float32).argmax()] += count
+        counts: dict[int, float] = {}  # of these states alone
         novelty = np.empty(len(states))
-        for t, state in enumerate(states.argmax(axis=1)):
+        for t, state in enumerate(states.argmax(axis=1).tolist()):
+            if state not in counts:
+                counts[state] = float(self.counts[state]) + visits.get(states[t].tobytes(), 0)
             counts[state] += 1
             novelty[t] = 1 / counts[state]
         return novelty
@@ -53,17 +57,17 @@ class HashedCountNovelty(Stateful, Novelty):
     STATE = ("episodes", "keys", "counts", "since")
 
     def __init__(self, config: NoveltyConfig) -> None:
-        self.decay, self.episodes = config.count_decay, 0
+        self.decay, self.episodes, self.warned = config.count_decay, 0, False
         self.known: dict[bytes, tuple[float, int]] = {}  # count, and after how many episodes
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         return self.continued(states, {})
 
     def continued(self, states: np.ndarray, visits: Mapping[bytes, int]) -> np.ndarray:
-        own, novelty = Counter(visits), np.empty(len(states))
+        own, novelty = Counter[bytes](), np.empty(len(states))
         for t, state in enumerate(map(np.ndarray.tobytes, states)):
             own[state] += 1
-            novelty[t] = 1 / (self.count(hashed(state)) + own[state])
+            novelty[t] = 1 / (self.count(hashed(state)) + visits.get(state, 0) + own[state])
         return novelty
 
     def count(self, key: bytes) -> float:
@@ -72,6 +76,9 @@ class HashedCountNovelty(Stateful, Novelty):
         return count * self.decay ** (self.episodes - since)
 
     def observe(self, states: np.ndarray) -> None:
+        if not self.warned and abs(states).max() >= TOLD_APART:
+            self.warned = True
+            logger.warning("whole numbers of 2^24 and more are not told apart, but count as one")
         visits = Counter(map(np.ndarray.tobytes, states))
         found = {(key := hashed(state)): self.count(key) + n for state, n in visits.items()}
         self.episodes += 1

@@ -142,7 +142,10 @@ class DensityNovelty(Stateful, Novelty):
         log_probs = self.density.log_prob(self.normaliser(samples[-1]))
         require_finite("a log-density", log_probs)
         self.log_density_threshold = quantile(log_probs.astype(np.float64), 1 - KNOWN)
-        known = samples[-1][: self.config.calibration_states]
+        count = self.config.calibration_states
+        known = samples[-1][:count]  # which were drawn alike
+        if count > len(known):
+            known = self.visited[self.batches.integers(self.seen, size=count)]
         squared_distances, _ = self.neighbours.nearest(known, self.largest + 1)
         others = np.ascontiguousarray(squared_distances[:, 1:])  # the nearest is itself
         distances = np.ascontiguousarray(mean_distances(others, self.ensemble).T)

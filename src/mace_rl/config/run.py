@@ -31,6 +31,10 @@ def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
             f"{min(of_gymnasium)!r} is not for the environment's constructor"
             + beside * "; max_episode_steps is a setting beside environment_arguments"
         )
+    if arguments.get("map_name", "") is None and arguments.get("desc") is None:
+        raise ValueError(
+            "map_name is null, with which FrozenLake draws a map that no seed determines: give desc"
+        )
     return arguments
 
 

@@ -48,7 +48,7 @@ class CuriosityConfig(Section):
     def _not_meta(cls, beta: Any) -> Any:
         if not isinstance(beta, Mapping):
             return {"kind": "constant", "value": beta}
-        if beta.get("kind") in BETA_SECTIONS:
+        if beta.get("kind") in {kind for kinds in BETA_SECTIONS.values() for kind in kinds}:
             raise ValueError(
                 "meta-adaptation asks for policy gradients and the budget, which only our trainer "
                 "has: kind should be constant, exponential or custom"

@@ -68,7 +68,6 @@ class Environment(Spaces):
     error in making or resetting it, a missing time limit and unsupported spaces.
     """
 
-    clips_actions = True  # Box ones to their bounds
     env: gymnasium.Env[Any, Any]
 
     def __init__(

@@ -23,6 +23,8 @@ class Spaces:
     Discrete or MultiDiscrete space is one-hot, an image is a row of numbers.
     """
 
+    clips_actions = True  # Box ones to their bounds
+
     def __init__(
         self,
         name: str,
@@ -108,8 +110,8 @@ def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> Non
         what = f"the observation{entry} is of {type(space).__name__}"
         raise ConfigError(
             f"environment {name!r}: {what}, and not so many numbers at every step; name a wrapper "
-            "that leaves it out, such as gymnasium.wrappers:FilterObservation, or makes numbers of "
-            "it: environment_wrappers, or --wrapper"
+            "that leaves it out or makes numbers of it: in environment_wrappers, such as "
+            "gymnasium.wrappers:FilterObservation with its arguments, or by --wrapper without"
         )
 
 
@@ -118,10 +120,15 @@ def flat_part(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
     if not isinstance(space, Dict):
         return space
     parts = {key: flat_part(part) for key, part in space.items()}
-    flat: dict[str, Any] = {
-        key: part for key, part in parts.items() if isinstance(part, (*FLAT, Dict, Tuple))
-    }
+    flat: dict[str, Any] = {key: part for key, part in parts.items() if has_flat_form(part)}
     return Dict(flat) if flat else space
+
+
+def has_flat_form(space: gymnasium.Space[Any]) -> bool:
+    """Whether observations are vectors, or become some."""
+    if isinstance(space, Dict | Tuple) and len(space):
+        return all(map(has_flat_form, space.values() if isinstance(space, Dict) else space))
+    return isinstance(space, FLAT)
 
 
 def is_discrete(space: gymnasium.Space[Any]) -> bool:

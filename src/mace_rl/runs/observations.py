@@ -40,7 +40,7 @@ def _as_given(given: Any, space: Space[Any]) -> Tensor:
     match space, given:
         case Dict() | Tuple(), [tuple() | Mapping(), *_] if isinstance(given, list):
             return torch.stack([_as_given(one, space) for one in given])
-        case Dict(), Mapping() if given.keys() == space.keys():
+        case Dict(), Mapping() if given.keys() >= space.keys():
             return torch.cat([_as_given(given[name], part) for name, part in space.items()], -1)
         case Tuple(), tuple() | list() | np.ndarray(ndim=1):
             return torch.cat([_as_given(*pair) for pair in zip(given, space, strict=True)], -1)

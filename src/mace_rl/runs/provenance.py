@@ -19,6 +19,7 @@ from mace_rl.base.files import content
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check, short_repr
+from mace_rl.environments import registered
 
 # The packages whose version can change a result.
 PACKAGES = (
@@ -65,7 +66,7 @@ def identity(config: RunConfig) -> dict[str, Any]:
     own = (file for key, name in named for file in source_files(name, key))
     return {
         "config": config.settings(),
-        "versions": versions(),
+        "versions": versions(config),
         "sources": code_digest.digest("training", *own),  # the user's own code included
     }
 
@@ -88,13 +89,21 @@ def file_digest(path: Path) -> str:
     return hashlib.sha256(content(path)).hexdigest()
 
 
-def versions() -> dict[str, str]:
-    """Python's version and those of `PACKAGES` that are installed."""
+def versions(config: RunConfig) -> dict[str, str]:
+    """Python's version and those of `PACKAGES`, and of the environment's, that are installed."""
     found = {"python": platform.python_version()}
-    for name in PACKAGES:
+    for name in dict.fromkeys([*PACKAGES, *packages_of_environment(config)]):
         with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     return found
+
+
+def packages_of_environment(config: RunConfig) -> list[str]:
+    """The environment's package and those of its wrappers, as if called like their modules."""
+    entry = getattr(registered().get(config.environment.rpartition(":")[2]), "entry_point", None)
+    places = [entry if isinstance(entry, str) else "", *(name for name, _ in config.wrappers)]
+    modules = (re.split(r"[.:]", place)[0].replace("_", "-") for place in places)
+    return [name for name in modules if name not in ("", "mace-rl")]
 
 
 def git_state() -> dict[str, Any]:

@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import iterate
 
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
@@ -140,19 +141,26 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
         """The environments' reset; of those in `options["reset_mask"]` if that is there."""
         chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
         observations, infos = self.env.reset(seed=seed, options=options)
+        seen = self._apart(observations)
         for i in np.flatnonzero(chosen).tolist():
-            self.tracker.begin(i, observations[i], afresh=seed is not None)
+            self.tracker.begin(i, seen[i], afresh=seed is not None)
         return observations, infos
+
+    def _apart(self, observations: Any) -> Any:
+        """By environment; of a Dict or Tuple space there are arrays of the parts."""
+        if isinstance(observations, np.ndarray):
+            return observations
+        return list(iterate(self.env.observation_space, observations))
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """The environments' step, with other rewards, float64, and more in `infos`."""
         recorded = [self.tracker.as_recorded(action) for action in actions]
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
-        reached = observations
+        reached = seen = self._apart(observations)
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
-            final = infos["final_obs"]
-            reached = [final[i] if ended[i] else observations[i] for i in range(self.num_envs)]
+            final = self._apart(infos["final_obs"])
+            reached = [final[i] if ended[i] else seen[i] for i in range(self.num_envs)]
         over = np.array([recording is None for recording in self.tracker.recordings])
         fresh = over & (self.mode is AutoresetMode.NEXT_STEP)  # only reset
         values = np.zeros((len(PARTS), self.num_envs))
@@ -162,7 +170,7 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
         for i in np.flatnonzero(ended).tolist():
             self.tracker.end(i, bool(terminated[i]))
         for i in np.flatnonzero(ended if self.mode is AutoresetMode.SAME_STEP else fresh).tolist():
-            self.tracker.begin(i, observations[i])
+            self.tracker.begin(i, seen[i])
         total = np.where(fresh, rewards, values[0] + values[1])  # extrinsic and curiosity
         added = dict(zip(PARTS, values, strict=True))
         masks = dict.fromkeys((f"_{name}" for name in PARTS), ~fresh)
@@ -171,8 +179,12 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
 
 def given(arguments: dict[str, Any]) -> dict[str, Any]:
     """The settings among a constructor's arguments, without memory or novelty if None."""
-    omitted = [name for name in ("memory", "novelty") if arguments[name] is None]
-    return {name: arguments[name] for name in CuriosityConfig.model_fields if name not in omitted}
+    found = {name: arguments[name] for name in CuriosityConfig.model_fields}
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in found.items()
+        if value is not None or name not in ("memory", "novelty")
+    }
 
 
 def name_of(env: Any) -> str:

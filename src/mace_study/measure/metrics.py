@@ -15,7 +15,7 @@ import numpy as np
 
 from mace_rl.config.plugins import load
 from mace_rl.config.section import ConfigError
-from mace_study.config.metrics import MetricsConfig
+from mace_study.config.metrics import GOALS, MetricsConfig
 
 PUBLIC_CODE_WINDOW = 50  # [R] episodes of the moving average, and over which it is to be flat
 PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
@@ -227,7 +227,7 @@ def solved(curve: LearningCurve) -> float:
 
 
 def _public_code_first(window: int, episodes: int) -> int:
-    return int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1
+    return max(1, int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1)
 
 
 def _episodes(
@@ -277,8 +277,11 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
         elif metric.unit not in COLUMN_TYPES:
             units = ", ".join(COLUMN_TYPES)
             problem = f"has the unit {metric.unit!r}, but should have one of {units}"
+        elif metric.needs not in (None, *GOALS):
+            goals = " or ".join(GOALS)
+            problem = f"needs {metric.needs!r}, but should need {goals} or None"
         else:
-            metrics.append(metric)
+            metrics += [metric] if metric.needs is None or getattr(settings, metric.needs) else []
             continue
         raise ConfigError(f"metrics.custom has {reference!r}, which {problem}")
     return tuple(metrics)

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +41,7 @@ def animations(
     missing = []
     without = [folder for folder in runs.values() if not (folder / files.AGENT).exists()]
     if without:
-        names = ", ".join(str(folder.relative_to(origin)) for folder in without)
+        names = ", ".join(os.path.relpath(folder, origin) for folder in without)
         missing.append(f"Not shown, because {files.AGENT} is not there, are the agents of {names}.")
     folders: dict[str, dict[str, Path]] = {}
     for (environment, variant), folder in runs.items():

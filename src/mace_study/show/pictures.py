@@ -1,6 +1,7 @@
 """Pictures of all runs at once, each drawn from data that stands beside it as CSV."""
 
 import itertools
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -175,7 +176,7 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     words = []
     metric = metric_labels(source.settings).get(part.metric, part.metric).lower()
     if any(other.environments != part.environments for other in parts):
-        words += [name.rpartition("-v")[0] for name in part.environments]
+        words += [_short(name, parts) for name in part.environments]
     if any(other.metric != part.metric for other in parts):
         words.append(metric)
     called = source.claims.variants
@@ -184,6 +185,14 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
         differ = any(other.variant != part.variant for other in parts)
         words.append(f"{called.get(part.variant, part.variant)} {over}" if differ else over)
     return ", ".join(words) or metric
+
+
+def _short(environment: str, parts: Sequence[Finding]) -> str:
+    """Without module and version, unless these tell it from another of the claim."""
+    names = dict.fromkeys(name for part in parts for name in part.environments)
+    short = {name: re.sub(r"^.*:|-v\d+$", "", name) for name in names}
+    alike = list(short.values()).count(short[environment]) > 1
+    return environment if alike else short[environment]
 
 
 def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
@@ -280,7 +289,7 @@ def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
                     axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)
                     dot: dict[str, Any] = {"color": colour, "markersize": 3.5}
                     dot["markerfacecolor"] = "white" if source == PAPER else colour
-                    dot["label"] = look.labels[name] if place == 1 else None
+                    dot["label"] = None if source == PAPER else look.labels[name]
                     axes.plot(row["mean"], place + shift, "o", **dot)
             for place in range(len(lines) - 1):
                 axes.axhline(place + 0.5, color="0.9", linewidth=0.6, zorder=0)

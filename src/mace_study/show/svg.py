@@ -33,9 +33,13 @@ def panels(
 
 
 def _thinned(frame: pd.DataFrame) -> pd.DataFrame:
-    episodes = sorted(frame["episode"].unique())
-    kept = episodes[:: -math.ceil(len(episodes) / MAX_POINTS)]
-    return frame[frame["episode"].isin(kept)]
+    """Fewer points of each variant: variants may have different episodes."""
+
+    def kept(episodes: pd.Series) -> pd.Series:
+        own = sorted(episodes.unique())
+        return episodes.isin(own[:: -math.ceil(len(own) / MAX_POINTS)])
+
+    return frame[frame.groupby("variant")["episode"].transform(kept)]
 
 
 def svg(figure: Figure, name: str, label: str) -> str:

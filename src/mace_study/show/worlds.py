@@ -152,8 +152,9 @@ def draw_curves(curves: Mapping[str, pd.DataFrame], shown: Quantity, look: PlotS
                 axes.locator_params(nbins=4)
                 draw_means(axes, means, look)
         for column, _ in enumerate(environments):
-            for axes in panels[column + len(environments) :: len(environments)]:
-                axes.sharey(panels[column])
-                axes.sharex(panels[column])
+            first, *others = (axes for axes in panels[column :: len(environments)] if axes.axison)
+            for axes in others:
+                axes.sharey(first)
+                axes.sharex(first)
         legend(figure, f"Line: mean over seeds. Band: its {100 * look.confidence:g} % interval.")
     return figure
