@@ -22,7 +22,7 @@ import os
 import re
 import sys
 import tarfile
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -208,18 +208,21 @@ def unpack(archives: Path, results: Path) -> int:
 
     Raises `ValueError` if there are none.
     """
-
-    def put_back(archive: Path) -> int:
-        variant = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
-        content = read(archive)
-        _put(variant, content)
-        return sum(name.endswith(files.RECORD) for name in content)
-
     packed = sorted(archives.glob("*/*.tar.xz"))
     if not packed:
         raise ValueError(f"{archives}: no ENV/VARIANT.tar.xz in it")
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return sum(pool.map(put_back, packed))
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return sum(pool.map(_put_back, packed, itertools.repeat(results)))
+
+
+def _put_back(archive: Path, results: Path) -> int:
+    content = read(archive)
+    _put(_folder(archive, results), content)
+    return sum(name.endswith(files.RECORD) for name in content)
+
+
+def _folder(archive: Path, results: Path) -> Path:
+    return results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
 
 
 def unpack_sample(archives: Path, results: Path, count: int) -> int:
@@ -235,9 +238,8 @@ def unpack_sample(archives: Path, results: Path, count: int) -> int:
         archive, content = packed[place], read(packed[place])
         run = draws.choice([name for name in content if name.endswith(files.RECORD)])
         if json.loads(content[run])["seconds"] < LONGEST:
-            folder = results / "runs" / archive.parent.name / archive.name.removesuffix(".tar.xz")
             names = (run, run.replace(files.RECORD, files.EPISODES))
-            _put(folder, {name: content[name] for name in names})
+            _put(_folder(archive, results), {name: content[name] for name in names})
             left -= 1
     if left:
         raise ValueError(f"{archives}: {count - left} runs in it that take less than {LONGEST} s")

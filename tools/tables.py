@@ -17,7 +17,7 @@ import re
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +132,9 @@ def main() -> None:
         outputs[name] = [*outputs[name], README]
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
-    for name, own in outputs.items():
-        for picture in (MADE / name / output for output in own if output.endswith(".png")):
-            reduce_colours(picture)
+    made = [MADE / name / output for name, own in outputs.items() for output in own]
+    with ProcessPoolExecutor(CORES) as pool:
+        list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
     print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")
