@@ -47,10 +47,10 @@ test-wheel: setup ## the wheel in environments of its own: newest, lowest, Debia
 	@.ci/wheel
 
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
-	@$(IN_VENV) tools.tables $(if $(CI),--check)
+	@$(IN_VENV) tools.tables --cores $(CORES) $(if $(CI),--check)
 
 report: setup ## one page of a kept study, without training: verdicts and figures (STUDY=tuned)
-	@$(IN_VENV) tools.tables --report $(or $(STUDY),tuned)
+	@$(IN_VENV) tools.tables --cores $(CORES) --report $(or $(STUDY),tuned)
 
 bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a change slower? (minutes)
 	@$(call one_of,BENCH,quick)

@@ -269,6 +269,7 @@ MISTAKES = [  # one text for another, and what is said of it
     ("over: [ppo, mace_fixed]", "over: [mace_full]", ["C1.parts", "the variant itself"]),
     ("robust: *above", "rubust: *above", ["C7.parts", "'rubust'", "'robust'"]),
     ("          robust: *above\n", "", ["C7.parts", "'robust'] as the first"]),
+    ("  robust: decides,", "  claim: x\n  robust: decides,", ["ways has 'claim'", "claims.json"]),
     ("    C2:", "    Q1:", ["elsewhere.claims.Q1", "twice"]),
     ("mace_full: [249, 586]", "mace_full: [249]", ["Acrobot-v1.mace_full is [249]", "2 numbers"]),
     (

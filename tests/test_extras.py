@@ -169,6 +169,17 @@ def test_a_bonus_of_one_s_own(run_config):
             finish(trainer)
 
 
+class Bare(Fixed):
+    def bonus(self, episode):
+        return np.ones(len(episode))
+
+
+def test_a_bonus_that_gives_an_array_is_told_what_to_give(run_config):
+    bonus = {"kind": "custom", "estimator": "test_extras:Bare"}
+    with refused(ConfigError, r"Bare.bonus is .*, but should be a mace_rl.bonus.intrinsic.Bonus"):
+        finish(run_config("CartPole-v1", "mace_fixed", 0, bonus=bonus, episodes=2))
+
+
 def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
     """Of the same kind it changes some keys; of another it leaves nothing of it."""
     file = tmp_path / "over.yaml"

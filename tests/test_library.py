@@ -125,6 +125,16 @@ def test_a_variant_s_name_is_that_of_a_folder(tmp_path, name):
         settings("CartPole-v1", name, config=tmp_path / "own.yaml", episodes=2)
 
 
+def test_an_empty_folder_is_no_folder():
+    with refused(ConfigError, "folder is empty, but should be a path, or None"):
+        train(settings("CartPole-v1", "ppo", episodes=2), folder="")
+
+
+def test_what_several_keys_say_together_is_blamed_on_no_layer():
+    with refused(ConfigError, "in the settings of CartPole-v1 and ppo, bonus is"):
+        settings("CartPole-v1", "ppo", trainer="published")
+
+
 def test_what_no_layer_has_is_missing_in_the_variant(tmp_path):
     (tmp_path / "own.yaml").write_text("variant_settings: {own: {label: x}}")
     with refused(ConfigError, "in variant_settings.own, the key 'beta' is missing"):

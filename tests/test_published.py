@@ -144,6 +144,15 @@ def test_it_resumes_and_repeats_to_the_bit(
     assert first.tolist() == again.tolist()
 
 
+def test_without_dropout_the_meta_network_reads_the_same_twice():
+    trainer = PublishedTrainer(make(published={"dropout": False}))
+    [item], found = trainer.collect(), set()
+    for _ in range(3):
+        trainer.controller.read(item.episode, np.zeros(len(item.episode)))
+        found.add(trainer.controller.printed)
+    assert len(found) == 1
+
+
 BOOTSTRAPPED = {"bootstrap_at_time_limit": True, "normalise_returns": False}
 
 

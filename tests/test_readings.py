@@ -103,6 +103,19 @@ def test_runs_that_never_got_there_are_censored_at_the_end() -> None:
     assert "ppo" in cells and f"mace_full {rows.loc['mace_full', 'mean']:.0f}†" in cells
 
 
+def test_a_longer_budget_makes_nobody_later(frames: Frames) -> None:
+    """With the budget of ppo, 30 episodes, mace_full never gets there either."""
+    short, reading = {}, "sample_efficiency_common"
+    for (env, variant, seed), own in frames.items():
+        late = np.where(np.arange(EPISODES) < 350, 20.0, 450.0)
+        returns = own["extrinsic_return"] * 0 + (20.0 if variant == "ppo" else late)
+        new = frame(returns.to_numpy()[: 300 if variant == "ppo" else EPISODES])
+        short[env, variant, seed] = new
+    rows = select(r.readings(short, STUDY.metrics, CLAIMS.table1), reading, r.RUNS)
+    assert rows["censored"].to_dict() == {"ppo": 6, "mace_fixed": 0, "mace_full": 0}
+    assert set(rows["rank"]) == {1} and np.nanmin(rows["p_value"]) == 1
+
+
 def test_an_environment_that_the_paper_has_not(frames: Frames) -> None:
     changes = {"random_return": {"Other-v0": 20.0}, "reference_return": {}}
     settings = STUDY.metrics.model_copy(update=changes)

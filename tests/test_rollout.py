@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Text, Tuple
-from shared import ENGINES, Bonanza, acting, environment_of
+from shared import ENGINES, Bonanza, acting, environment_of, finish
 
 from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.config.section import ConfigError
@@ -242,7 +242,7 @@ def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
     [
         ({}, None, "has no time limit .*set one"),
         ({}, 10**9, "has a time limit of 1000000000 .*set one of 1 to 1000000"),
-        ({"observation_space": Text(3)}, 10, "the observation is of Text.*, or --wrapper"),
+        ({"observation_space": Text(3)}, 10, "the observation is of Text.*, or by --wrapper"),
         ({"observation_space": Box(0, 9, (84, 84, 4), np.uint8)}, 10, "has 28224 numbers"),
         ({"action_space": MultiDiscrete([2, 2])}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, (2, 2))}, 10, "Discrete and one-dim"),
@@ -310,6 +310,18 @@ def test_what_is_not_gymnasium_s_form_is_told_in_one_line(register, method, does
         return
     with pytest.raises(ConfigError, match=rf"^environment [^\n]*{message}[^\n]*$"):
         play(environment_of("Odd-v0"))
+
+
+class Endless(gymnasium.Wrapper):
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+def test_a_wrapper_that_hides_the_time_limit_is_told(run_config):
+    around = {"environment_wrappers": ["test_rollout:Endless"], "max_episode_steps": 20}
+    with pytest.raises(ConfigError, match="goes on after 20 steps, its time limit: a wrapper"):
+        finish(run_config("MountainCar-v0", "ppo", 0, episodes=2, **around))
 
 
 PARTS = Dict(a=Discrete(3), b=Tuple([Box(0, 1, (2,)), Box(0, 1, (1,))]), c=MultiDiscrete([2, 3]))

@@ -118,6 +118,18 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
 # --- random_return --------------------------------------------------------------------------------
 
 
+def test_a_random_return_has_the_study_s_wrappers(tmp_path) -> None:
+    over = tmp_path / "over.yaml"
+    wrapper = "{wrapper: 'gymnasium.wrappers:TransformReward', arguments: {func: null}}"
+    own = wrapper.replace("TransformReward", "ClipReward").replace("func: null", "max_reward: 0.5")
+    over.write_text(f"environment_settings: {{CartPole-v1: {{environment_wrappers: [{own}]}}}}")
+    lengths, halves = (
+        random_return.random_returns(random_return.configuration("CartPole-v1", files), 20)
+        for files in ([], [str(over)])
+    )
+    assert (halves == lengths / 2).all()
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

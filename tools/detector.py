@@ -86,6 +86,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--streams", type=int, default=200, help="default: %(default)s")
     count = parser.parse_args().streams
+    if count < 1:
+        parser.error(f"--streams is {count}, but should be at least 1")
     of_meta = {
         "network": {},
         "a constant input": {"reads": False},

@@ -2,8 +2,8 @@
 
     .venv/bin/python -m tools.random_return ENVIRONMENT EPISODES [CONFIG ...]
 
-The environment is the one that a study trains in: with the time limit and the arguments that
-config.yaml, and the files CONFIG read over it, set for it.
+The environment is the one that a study trains in: with the time limit, the arguments and the
+wrappers that config.yaml, and the files CONFIG read over it, set for it.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from mace_rl.config.plugins import make
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
@@ -46,6 +47,8 @@ def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
         env = gymnasium.make(
             config.environment, max_episode_steps=config.max_episode_steps, **arguments
         )
+        for place, (reference, own) in enumerate(config.wrappers):
+            env = make(reference, f"environment_wrappers.{place}", gymnasium.Env, False, env, **own)
     except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{config.environment} cannot be made: {reason}") from error

@@ -1,6 +1,6 @@
 """The tables, figures and verdicts of the studies that are kept, without training.
 
-    python -m tools.tables [--check]        (make tables)
+    python -m tools.tables [--check] [--cores N]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
 The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY, the outputs that
@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from mace_rl.config.reading import read_yaml
 from tools import kept_runs, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
-CORES = len(os.sched_getaffinity(0))
 
 STUDIES = Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
@@ -40,7 +40,7 @@ RULES = (
 )
 
 
-def make(name: str, study: dict[str, Any]) -> None:
+def make(name: str, study: dict[str, Any], cores: int) -> None:
     """Make the `outputs` of one study; `ValueError` with what Snakemake says if it cannot.
 
     Where it is started `config/` is the project's, so that the pages name the command.
@@ -50,7 +50,7 @@ def make(name: str, study: dict[str, Any]) -> None:
     (folder / "runs").symlink_to(ROOT / MADE / study["runs"] / "runs", target_is_directory=True)
     (folder / "config").symlink_to(ROOT / "config", target_is_directory=True)
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
-    command += ["--cores", str(CORES), "--allowed-rules", *RULES]
+    command += ["--cores", str(cores), "--allowed-rules", *RULES]
     command += ["--configfile", *study["configfiles"]]
     command += ["--config", f"results={folder}", *study["config"]]
     command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
@@ -61,10 +61,11 @@ def make(name: str, study: dict[str, Any]) -> None:
         raise ValueError(f"{name}: {done.stdout.strip()}")
 
 
-def make_all(studies: dict[str, Any]) -> None:
-    """Make the outputs of every study, as many studies at once as there are cores."""
-    with ThreadPoolExecutor(CORES) as pool:
-        list(pool.map(make, studies, studies.values()))
+def make_all(studies: dict[str, Any], cores: int) -> None:
+    """Make the outputs of every study, as many studies at once as there are cores for."""
+    at_once = min(cores, len(studies))
+    with ThreadPoolExecutor(at_once) as pool:
+        list(pool.map(make, studies, studies.values(), repeat(cores // at_once)))
 
 
 def write_readme(name: str, outputs: list[str]) -> None:
@@ -105,7 +106,13 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="keep and renew nothing")
     parser.add_argument("--report", metavar="STUDY", help="make only this study's page")
+    parser.add_argument("--cores", default="all", metavar="N", help="jobs at once, default: all")
     arguments = parser.parse_args()
+    cores = len(os.sched_getaffinity(0))
+    if arguments.cores != "all":
+        if not arguments.cores.isdecimal() or not int(arguments.cores):
+            parser.error(f"--cores is {arguments.cores!r}, but should be all, or at least 1")
+        cores = int(arguments.cores)
     check, only = arguments.check, arguments.report
     os.chdir(ROOT)
     studies = read_yaml(STUDIES)
@@ -120,7 +127,8 @@ def main() -> None:
     try:
         runs = sum(kept_runs.unpack(Path(archive), MADE / archive) for archive in archives)
         make_all(
-            {name: wanted[name] | {"outputs": [*own, TABLES]} for name, own in outputs.items()}
+            {name: wanted[name] | {"outputs": [*own, TABLES]} for name, own in outputs.items()},
+            cores,
         )
     except ValueError as error:
         sys.exit(f"tables: {error}")
@@ -133,7 +141,7 @@ def main() -> None:
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
     made = [MADE / name / output for name, own in outputs.items() for output in own]
-    with ProcessPoolExecutor(CORES) as pool:
+    with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))

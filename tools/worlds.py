@@ -15,6 +15,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from mace_rl.base.errors import Refusal
 from mace_study.compare.claims_config import read_claims
 from mace_study.compare.ledger import read_ledger
 from mace_study.compare.single_seeds import draw, numbers
@@ -26,8 +27,9 @@ from mace_study.show.sections import Section
 from mace_study.show.tables import side_by_side
 
 WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
-CONFIG = Path("config.yaml")  # every world has its labels, colours and measures ...
-VARIANTS = Path("config/worlds/tuned.yaml")  # ... and variants that this has
+ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / "config.yaml"  # every world has its labels, colours and measures ...
+VARIANTS = ROOT / "config" / "worlds" / "tuned.yaml"  # ... and variants that this has
 DECIDES = "robust"  # the way to measure that is counted and pictured
 COMMAND = "`python -m tools.worlds`"
 # The metrics that the protocol names; the first is not the public code's rule, as its words ask.
@@ -166,7 +168,11 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, help="where the worlds' folders are")
     folder = parser.parse_args().folder
-    if not (made := make(folder)):
+    try:
+        made = make(folder)
+    except (Refusal, OSError) as error:
+        sys.exit(f"worlds: {error}")
+    if not made:
         sys.exit(f"worlds: {folder} has no {WORLDS[0]}/metrics.csv, nor that of another world")
     print(*(folder / FOLDER / name for name in made), sep="\n")
 

@@ -82,8 +82,10 @@ def train(
     from mace_rl.runs.agent import load_agent  # torch takes seconds
     from mace_rl.runs.run import run
 
+    if folder is not None and not str(folder):
+        raise ConfigError("folder is empty, but should be a path, or None to keep nothing")
     with tempfile.TemporaryDirectory() as scratch:
-        directory = Path(folder or scratch).absolute()
+        directory = Path(scratch if folder is None else folder).absolute()
         if restart or not finished(settings, directory):
             run(settings, directory, None, False, callback, "all" if restart else "nothing")
         return Trained(load_agent(directory, trust=True), FinishedRun(directory).rows)

@@ -91,14 +91,17 @@ class Critic(Actor):
 class MetaNetwork(nn.Module):
     """An episode's steps, [1, T, inputs] → [1, 1], of which β is the logistic function."""
 
-    def __init__(self, inputs: int, units: int = 128) -> None:
+    def __init__(self, inputs: int, dropout: bool, units: int = 128) -> None:
         super().__init__()
-        self.begin = nn.Sequential(*layer(inputs, units, 0.1))
-        self.lstm = nn.LSTM(units, units, 3, batch_first=True, dropout=0.15, bidirectional=True)
-        attention = [nn.MultiheadAttention(2 * units, 8, 0.1, batch_first=True) for _ in range(2)]
+        little, more = 0.1 * dropout, 0.15 * dropout
+        self.begin = nn.Sequential(*layer(inputs, units, little))
+        self.lstm = nn.LSTM(units, units, 3, batch_first=True, dropout=more, bidirectional=True)
+        attention = [
+            nn.MultiheadAttention(2 * units, 8, little, batch_first=True) for _ in range(2)
+        ]
         self.attention = nn.ModuleList(attention)
         self.norms = nn.ModuleList(nn.LayerNorm(2 * units) for _ in attention)
-        ends = [*layer(2 * units, units, 0.15), *layer(units, units // 2, 0.0)]
+        ends = [*layer(2 * units, units, more), *layer(units, units // 2, 0.0)]
         self.end = nn.Sequential(*ends, nn.Linear(units // 2, 1))
 
     def forward(self, steps: Tensor) -> Tensor:
@@ -195,10 +198,10 @@ class Meta(Stateful):
 
     STATE = ("printed", "draws")
 
-    def __init__(self, spaces: Spaces, draws: np.random.Generator) -> None:
+    def __init__(self, spaces: Spaces, dropout: bool, draws: np.random.Generator) -> None:
         self.printed, self.draws, self.actions = 0.0, draws, spaces.action_size
         with drawing_from(draws):
-            self.network = MetaNetwork(spaces.observation_size + self.actions + 2)
+            self.network = MetaNetwork(spaces.observation_size + self.actions + 2, dropout)
 
     def read(self, episode: Episode, bonus: np.ndarray) -> None:
         """An episode and, or zeros in its place, its bonus, [T]."""
@@ -281,7 +284,8 @@ class PublishedTrainer(Trainer):
             raise ConfigError(reason)
         self.settings, bonus = config.published, config.beta.kind != "none"
         self.curiosity = Curiosity(config.published, environment) if bonus else None
-        self.controller = Meta(environment, streams["meta"]) if bonus else None
+        own = environment, config.published.dropout, streams["meta"]
+        self.controller = Meta(*own) if bonus else None
         self.ppo = PPO(networks(config, environment, streams), streams["dropout"])
         self.play = self._play
 

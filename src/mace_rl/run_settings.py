@@ -125,7 +125,10 @@ def _resolve(given: RunSettings, environment: str, variant: str, changes: Settin
         location = error.errors(include_url=False)[0]["loc"]
         depths = {name: _depth(layers[name], location) for name in reversed(layers)}
         name = max(depths, key=depths.__getitem__)
-        name = name if depths[name] else f"variant_settings.{variant}"  # what no layer has
+        if not location:  # what several keys say together
+            name = f"the settings of {environment} and {variant}"
+        elif not depths[name]:  # what no layer has
+            name = f"variant_settings.{variant}"
         raise ConfigError(f"in {name}, {explain(error, RunConfig)}") from None
     for key, reference in config.references().items():
         source_files(reference, f"in the settings of {environment} and {variant}, {key}")

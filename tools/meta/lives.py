@@ -4,7 +4,6 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from mace_rl.training.checks import CheckedBeta
 from mace_rl.training.trainer import Trainer
 from tools.meta.tasks import Generated
 
-ROOT = Path(__file__).resolve().parents[2]
 GRID = (0.01, 0.2, 0.99)  # the βs under which a life goes on
 LATEST = 0.85  # the share of a life after which it is not continued any more
 

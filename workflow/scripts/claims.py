@@ -19,7 +19,7 @@ with job(snakemake):
     settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
     runs = read_metrics(found.metrics, given.runs, settings)
     betas = read_table(found.betas, betas_columns(settings))
-    runs = runs.merge(betas, how="left", validate="1:1")
+    runs = runs.merge(betas, how="left", on=["env", "variant", "seed"], validate="1:1")
     answers = verdicts.ledger(runs, settings, paper)
     hours = sum(read_record(Path(record))["seconds"] for record in found.records) / 3600
     cost = {"command": given.command, "runs": len(runs), "core_hours": hours}

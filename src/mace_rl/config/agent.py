@@ -59,8 +59,10 @@ class PPOConfig(Section):
     @model_validator(mode="after")
     def _units_agree(self) -> "PPOConfig":
         # A critic of normalised returns knows none as it was paid, so it may be part of none.
-        if self.normalise_returns and (self.gae_lambda < 1 or self.bootstrap_at_time_limit):
-            right = "gae_lambda: 1.0 and bootstrap_at_time_limit: false"
+        # And scales are measured on advantages as they were before.
+        own = self.gae_lambda < 1 or self.bootstrap_at_time_limit or self.scale_advantages
+        if self.normalise_returns and own:
+            right = "gae_lambda: 1.0, bootstrap_at_time_limit: false and scale_advantages: false"
             raise ValueError(f"normalise_returns goes with {right}")
         return self
 

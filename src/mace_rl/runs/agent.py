@@ -102,7 +102,9 @@ def load_agent(directory: str | Path, trust: bool = False) -> Agent:
     unless `trust`. Raises `CheckpointError` if `agent.pt` is not of such an agent, and what the
     parts of a `FinishedRun` raise.
     """
-    return Player.of(FinishedRun(directory, trust)).agent
+    player = Player.of(FinishedRun(directory, trust))
+    player.environment.env.close()
+    return player.agent
 
 
 class Player:

@@ -31,4 +31,5 @@ def evaluate(
         for episode in range(episodes):
             played = rollout(environment, policy, draw_noise(environment, generator))
             returns[episode] = total(played.rewards)
+    environment.env.close()
     return returns

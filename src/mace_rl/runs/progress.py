@@ -210,7 +210,7 @@ def read(path: Path, since: float, model: type[BaseModel]) -> Any:
     """
     try:
         content = json.loads(files.content(path)) if path.stat().st_mtime >= since else None
-    except (FileNotFoundError, ValueError):  # the latter also of what is no text
+    except (FileNotFoundError, RecursionError, ValueError):  # the last also of what is no text
         return None
     if content is not None:
         check(model, content, str(path))

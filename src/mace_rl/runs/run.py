@@ -76,7 +76,7 @@ def run(
                 (directory / files.CHECKPOINT).unlink()
             return
         started = time.monotonic()
-        identity = provenance.identity(config)
+        identity, code = provenance.identity(config), provenance.git_state()
         trainer = (PublishedTrainer if config.trainer == "published" else Trainer)(config)
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
@@ -110,10 +110,11 @@ def run(
                 save()
         if keep_checkpoint:
             save()
-        write_results(directory, trainer, identity, clock)
+        write_results(directory, trainer, identity | {"code": code}, clock)
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
         file.unlink(missing_ok=True)
+        trainer.environment.env.close()
 
 
 def to_continue(
@@ -237,7 +238,7 @@ def single_threaded() -> Iterator[None]:
         with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
             yield
     except SystemExit as error:
-        raise RunError(f"code of a plugin ended the program: {error!r}") from error
+        raise RunError(f"code from outside mace_rl ended the program: {error!r}") from error
     finally:
         torch.set_num_threads(threads)
         gc.unfreeze()
@@ -290,13 +291,12 @@ def progress_of(trainer: Trainer, clock: Clock) -> dict[str, Any]:
 def write_results(
     directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock
 ) -> None:
-    """Write the records, the agent and, last, `run.json`."""
+    """Write the records, the agent and, last, `run.json`; identity: with the code's commit."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
     agent = checkpoint.archive(Agent(trainer.ppo, trainer.environment.given_space).state_dict())
     write_atomically(directory / files.AGENT, agent)
     record = identity | {
-        "code": provenance.git_state(),
         "threads": torch.get_num_threads(),
         **clock.account(),
         "start_seconds": clock.start_seconds,

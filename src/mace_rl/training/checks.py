@@ -11,6 +11,7 @@ from mace_rl.beta.controller import BetaController
 from mace_rl.bonus.intrinsic import Bonus, IntrinsicReward
 from mace_rl.config.beta import LARGEST_BETA
 from mace_rl.config.run import RunConfig
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments.episode import Episode
 from mace_rl.numerics.finite import TOO_LARGE, numbers, require_finite, require_within
 from mace_rl.numerics.normaliser import RunningNormaliser
@@ -72,6 +73,9 @@ class CheckedBonus(Checked):
 
     def bonus(self, episode: Episode) -> Bonus:
         bonus = self.part.bonus(episode)
+        if not isinstance(bonus, Bonus):
+            wanted = f"but should be a {Bonus.__module__}.Bonus"
+            raise ConfigError(f"{type(self.part).__name__}.bonus is {short_repr(bonus)}, {wanted}")
         reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
         largest = min(self.part.largest, TOO_LARGE)
         require_within("the curiosity bonus", reward, 1e-6, largest)

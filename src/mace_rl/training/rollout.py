@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 
 from mace_rl.agent.policy import ActingPolicy, CompiledActing
+from mace_rl.config.section import ConfigError
 from mace_rl.environments import classic_control
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
@@ -42,6 +43,11 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     terminated = truncated = False
     t = 0
     while not (terminated or truncated):
+        if t == len(noise):
+            raise ConfigError(
+                f"environment {environment.name!r} goes on after {t} steps, its time limit: "
+                "a wrapper hides `truncated`"
+            )
         action: Any
         action, log_prob = policy.act(observations[t], noise[t])
         actions[t], log_probs[t] = action, log_prob

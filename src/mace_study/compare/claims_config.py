@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -10,6 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.reading import read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
+from mace_study.compare.ledger import Answer
 from mace_study.config.labels import require_latex
 from mace_study.config.metrics import MetricsConfig, Names, once
 from mace_study.measure.betas import CORRELATIONS
@@ -264,6 +266,8 @@ def _check_form(claims: ClaimsConfig) -> None:
                     f"table1.values.{environment}.{variant} is {numbers}, but each of"
                     f" table1.variants, and no other, should have {len(table1.metrics)} numbers"
                 )
+    if taken := {field.name for field in fields(Answer)}.intersection(claims.ways):
+        raise ConfigError(f"ways has {min(taken)!r}, which claims.json has a key for already")
     for title, family in claims.families.items():
         for name, claim in family.claims.items():
             key = f"families.{title}.claims.{name}"

@@ -77,7 +77,7 @@ def _compare(
     for runs in environments.values():
         both = runs[variant], runs[baseline]
         budget = min(int(own["episodes"].min()) for own in both)
-        x, y = (_reached(own, metrics, budget) for own in both)
+        x, y = (reached_within(own, metrics, budget) for own in both)
         reached.append((x, y))
         restricted.append((np.where(np.isinf(x), budget, x), np.where(np.isinf(y), budget, y)))
     signed = [(x * signs, y * signs) for x, y in restricted]
@@ -105,9 +105,9 @@ def _compare(
     return rows
 
 
-def _reached(runs: pd.DataFrame, metrics: Sequence[Metric], budget: int) -> np.ndarray:
+def reached_within(runs: pd.DataFrame, metrics: Sequence[Metric], budget: int) -> np.ndarray:
     """The metrics of one variant, [seeds, metrics]; episodes beyond the budget are np.inf."""
-    values = runs[[metric.name for metric in metrics]].to_numpy(np.float64)
+    values = runs[[metric.name for metric in metrics]].to_numpy(np.float64, copy=True)
     for place, metric in enumerate(metrics):
         if metric.unit == "episodes":
             never = (values[:, place] > budget) | (runs[metric.flag] == 1)

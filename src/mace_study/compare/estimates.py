@@ -20,7 +20,7 @@ from mace_study.measure.metrics import Metric, all_metrics, metric_units
 
 CONFIDENCE = 0.95  # of the intervals, whatever those of the tables have
 LEVEL = 0.05  # of the corrected p values
-WORTH_MENTIONING = 0.05  # of everything: of E, of reference - random, of a correlation of 1
+WORTH_MENTIONING = 0.05  # of everything: of reference - random, of a correlation of 1
 POWER = 0.8  # of the smallest difference that could have been shown, before correction
 
 

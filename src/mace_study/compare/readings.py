@@ -12,6 +12,7 @@ import pandas as pd
 
 from mace_rl.training.records import RunKey
 from mace_study.compare.claims_config import Table1Config
+from mace_study.compare.comparisons import reached_within
 from mace_study.compare.statistics import logrank
 from mace_study.compare.summary import summary
 from mace_study.config.metrics import MetricsConfig
@@ -53,7 +54,8 @@ def readings(
     frames: the records (`read_episodes`) of each run (environment, variant, seed). Columns: env,
     kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
-    mean) and p_value: of the log-rank test, not corrected, of this variant against that of rank 1.
+    mean, if training ended with the shortest budget of the environment's variants) and p_value: of
+    the log-rank test, not corrected, of this variant against that of rank 1.
     """
     found = kinds(settings, table1)
     runs = {RUNS: metrics_table(frames, settings)}
@@ -90,17 +92,19 @@ def _measured(
 ) -> pd.DataFrame:
     """The rows of one reading in a `summary`, with the rank and the test of each variant."""
     variants = rows["variant"].to_list()
-    first = variants[int(rows["mean"].argmin())]
+    budget = int(runs["episodes"].min())
     reached = {
-        str(name): np.where(own[metric.flag] == 1, np.inf, own[metric.name])
-        for name, own in runs.groupby("variant")
+        name: reached_within(runs[runs["variant"] == name], [metric], budget)[:, 0]
+        for name in variants
     }
+    means = pd.Series([np.minimum(reached[name], budget).mean() for name in variants], rows.index)
+    first = variants[int(means.argmin())]
     p_values = [np.nan] * len(variants)
     for place, name in enumerate(variants):
         if name != first:
             how = settings.bootstrap_repetitions, np.random.default_rng(settings.bootstrap_seed)
             p_values[place] = logrank(reached[first], reached[name], *how)
-    return rows.assign(rank=rows["mean"].rank(method="min").astype(int), p_value=p_values)
+    return rows.assign(rank=means.rank(method="min").astype(int), p_value=p_values)
 
 
 def title(kind: str, reading: str, source: str, names: Mapping[str, str]) -> str:
@@ -118,8 +122,8 @@ def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFra
 
 
 def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
-    """The rows in the order of their means, and whether the first place is more than chance."""
-    ordered = rows.sort_values("mean", kind="stable")
+    """The rows in the order of their ranks, and whether the first place is more than chance."""
+    ordered = rows.sort_values("rank", kind="stable")
     others = ordered["p_value"].iloc[1:]
     sure = others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1
     return ordered, bool(sure)

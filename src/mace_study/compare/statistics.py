@@ -150,10 +150,10 @@ def logrank(
     Episodes at which something was reached, np.inf where it never was (censored at the end of
     training). By permutations of observed minus expected events: all of them while there are
     ≤ `repetitions`, else so many random ones. (The normal approximation gives 0.025 for three runs
-    all later than three others; it is 0.1.) NaN with one run of each.
+    all later than three others; it is 0.1.) NaN with one run of either.
     """
     times, reached = np.concatenate([x, y]), np.isfinite(np.concatenate([x, y]))
-    if len(times) == 2:
+    if min(len(x), len(y)) == 1:
         return np.nan
     at_risk = np.sum(times[:, None] <= times, axis=1)  # [n + m]: those that are not earlier
     expected = (times[:, None] >= times) @ (reached / at_risk)

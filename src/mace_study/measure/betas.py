@@ -15,9 +15,7 @@ if TYPE_CHECKING:  # planning the workflow imports this module
     import pandas as pd
 
 # Columns beside β's own: in all of training, before and after the common bar.
-CORRELATION = "stagnation_correlation"
-BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
-CORRELATIONS = CORRELATION, BEFORE, AFTER
+CORRELATIONS = CORRELATION, BEFORE, AFTER = metrics.CORRELATIONS
 LABELS = {  # of columns, in tables
     "beta_end": "β at the end",
     "beta_lowest": "lowest β",
@@ -30,7 +28,7 @@ LABELS = {  # of columns, in tables
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:
     """The columns of betas.csv; without a common bar nothing is before or after it."""
     correlations = CORRELATIONS if settings.reference_return else [CORRELATION]
-    values = dict.fromkeys(["beta_end", "beta_lowest", "beta_highest", *correlations], float)
+    values = dict.fromkeys([*metrics.OF_BETAS[:3], *correlations], float)
     return {"env": str, "variant": str, "seed": int} | values
 
 

@@ -22,6 +22,10 @@ PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 PUBLIC_CODE_LAST = 10  # [R] episodes whose mean sets the bar of sample efficiency
 
+# Of betas.csv, which claims are judged by beside metrics.csv.
+CORRELATION = "stagnation_correlation"
+CORRELATIONS = CORRELATION, f"{CORRELATION}_before", f"{CORRELATION}_after"
+OF_BETAS = ("beta_end", "beta_lowest", "beta_highest", *CORRELATIONS)
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
 
@@ -272,8 +276,9 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
             problem = f"is no {__name__}.Metric but of type {type(metric).__name__}"
         elif not metric.name.isidentifier():
             problem = f"has the name {metric.name!r}, but a column's name should be a word"
-        elif {metric.name, metric.flag} & columns.keys():
-            problem = f"has the name {metric.name!r}, but metrics.csv has such a column already"
+        elif {metric.name, metric.flag} & {*columns, *OF_BETAS}:
+            place = "betas.csv" if metric.name in OF_BETAS else "metrics.csv"
+            problem = f"has the name {metric.name!r}, but {place} has such a column already"
         elif metric.unit not in COLUMN_TYPES:
             units = ", ".join(COLUMN_TYPES)
             problem = f"has the unit {metric.unit!r}, but should have one of {units}"

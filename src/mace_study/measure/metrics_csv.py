@@ -39,13 +39,21 @@ def metrics_of_run(
     metrics = all_metrics(settings)
     for metric in metrics:
         value = metric.function(curve)
-        if metric.unit == "episodes" and isinstance(value, Attained):
-            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
-        elif metric.unit != "episodes" and isinstance(value, Real) and math.isfinite(value):
-            row[metric.name] = float(value)
-        else:
+        number = value.number if isinstance(value, Attained) else value
+        real = isinstance(number, Real) and math.isfinite(number)
+        if isinstance(value, Attained) != (metric.unit == "episodes") or not real:
             kind = "an Attained" if metric.unit == "episodes" else "a finite number"
-            raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
+        elif isinstance(value, Attained) and number % 1:
+            kind = "an Attained of a whole number"
+        elif metric.unit == "share" and not 0 <= number <= 1:
+            kind = "a share, from 0 to 1"
+        elif isinstance(value, Attained):
+            row |= {metric.name: int(number), metric.flag: int(value.censored)}
+            continue
+        else:
+            row[metric.name] = float(number)
+            continue
+        raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
     return {name: row[name] for name in metrics_columns(metrics)}
 
 
