@@ -54,12 +54,12 @@ def test_damaged_checkpoint_is_not_continued(
 def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch, caplog):
     config, directory = interrupted.config, interrupted.directory
     before = content_of(directory)
-    found = provenance.versions()
+    found = provenance.versions(config)
     others = [
         ({"seed": 1}, None, "config.seed was 0 and is 1"),
         ({"ppo": {"clip": 0.3}}, None, "config.ppo.clip was 0.2 and is 0.3"),
         ({"beta": {"kind": "none"}}, None, "config.beta.kind was 'meta' and is 'none'"),
-        ({}, (provenance, "versions", lambda: found | {"torch": "9.9"}), "versions.torch was "),
+        ({}, (provenance, "versions", lambda _: found | {"torch": "9.9"}), "versions.torch was "),
         (
             {},
             (code_digest, "digest", lambda *paths: "0" * 64),
