@@ -14,7 +14,7 @@ import gymnasium
 import numba
 import numpy as np
 import pytest
-from shared import OUTCOME, ROOT, call, refused
+from shared import OUTCOME, ROOT, Bonanza, call, refused
 
 import mace_rl
 from mace_rl import load_agent, settings, train
@@ -22,6 +22,8 @@ from mace_rl.base.errors import Refusal
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics import compiling
+from mace_rl.runs import provenance
+from mace_rl.runs.evaluate import evaluate
 from mace_rl.training.records import read_episodes
 
 HEAVY = ["snakemake", "pybullet", "pybullet_envs_gymnasium", "pandas", "matplotlib", "seaborn"]
@@ -123,6 +125,37 @@ def test_a_variant_s_name_is_that_of_a_folder(tmp_path, name):
     (tmp_path / "own.yaml").write_text(json.dumps({"variant_settings": own}))
     with refused(ConfigError, "variant has '.*, but a name here becomes a folder"):
         settings("CartPole-v1", name, config=tmp_path / "own.yaml", episodes=2)
+
+
+class Counting(Bonanza):
+    open = 0
+
+    def __init__(self):
+        super().__init__()
+        type(self).open += 1
+
+    def close(self):
+        type(self).open -= 1
+
+
+def test_environments_are_closed_also_after_a_mistake(register, tmp_path):
+    name = register("Counting-v0", Counting, 5)
+    run = settings(name, "ppo", episodes=2)
+    train(run, folder=tmp_path)
+    evaluate(tmp_path, 2, seed=0, trust=True)
+    with pytest.raises(ZeroDivisionError):
+        train(run, lambda episode: 1 / 0)
+    assert Counting.open == 0
+
+
+def test_a_run_names_the_commit_that_it_began_with(monkeypatch, tmp_path):
+    states = iter(["first", "second"])
+    monkeypatch.setattr(provenance, "git_state", lambda: {"commit": next(states)})
+    run = settings("CartPole-v1", "ppo", episodes=2)
+    seen = []
+    train(run, lambda _: seen or seen.append(provenance.git_state()["commit"]), tmp_path)
+    code = json.loads((tmp_path / "run.json").read_text())["code"]
+    assert (code, seen) == ({"commit": "first"}, ["second"])
 
 
 def test_an_empty_folder_is_no_folder():

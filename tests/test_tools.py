@@ -137,7 +137,10 @@ def test_a_random_return_has_the_study_s_wrappers(tmp_path) -> None:
         (["nope:Foo-v0", "3"], "in the settings of nope:Foo-v0 and"),
         (["CliffWalking-v1", "3"], "environment has 'CliffWalking-v1', which has no time limit"),
         (["CartPole-v1", "3", "no.yaml"], "no.yaml: cannot be read: "),
-        (["CartPole-v1", "3", "maps.yaml"], "CartPole-v1 cannot be made: "),
+        (
+            ["CartPole-v1", "3", "maps.yaml"],
+            "environment 'CartPole-v1' with {'map_name'",
+        ),
         (["CartPole-v1", "1"], "EPISODES is 1, but should be at least 2"),
     ],
 )

@@ -22,6 +22,7 @@ import os
 import re
 import sys
 import tarfile
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -203,7 +204,7 @@ def _put(folder: Path, content: dict[str, bytes]) -> None:
         (folder / name).write_bytes(data)  # half of it would not be what run.json describes
 
 
-def unpack(archives: Path, results: Path) -> int:
+def unpack(archives: Path, results: Path, cores: int | None = None) -> int:
     """Put the runs in `archives` where they were below `results`; returns how many.
 
     Raises `ValueError` if there are none.
@@ -211,7 +212,7 @@ def unpack(archives: Path, results: Path) -> int:
     packed = sorted(archives.glob("*/*.tar.xz"))
     if not packed:
         raise ValueError(f"{archives}: no ENV/VARIANT.tar.xz in it")
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ProcessPoolExecutor(cores or len(os.sched_getaffinity(0))) as pool:
         return sum(pool.map(_put_back, packed, itertools.repeat(results)))
 
 
@@ -248,7 +249,7 @@ def unpack_sample(archives: Path, results: Path, count: int) -> int:
 
 def main() -> None:
     """Entry point."""
-    commands = {"pack": pack, "unpack": unpack}
+    commands: dict[str, Callable[[Path, Path], int]] = {"pack": pack, "unpack": unpack}
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
         epilog="example: python -m tools.kept_runs pack results reference/worlds/tuned",

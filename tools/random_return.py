@@ -14,17 +14,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from mace_rl.config.plugins import make
+from mace_rl.base.rng import Streams
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
+from mace_rl.training.factories import environment
 from mace_study.config.study import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def configuration(environment: str, overlays: list[str]) -> RunConfig:
-    """Of a run in `environment`, which needs no random return yet; `ConfigError` if there is none.
+def configuration(name: str, overlays: list[str]) -> RunConfig:
+    """Of a run in an environment, which needs no random return yet; `ConfigError` if none is there.
 
     The study's own environments and seeds are those of config.yaml, whatever the files over it say.
     """
@@ -34,7 +35,7 @@ def configuration(environment: str, overlays: list[str]) -> RunConfig:
     origin = " + ".join(["config.yaml", *overlays])
     own = {"environments": base["environments"], "environment_seeds": {}}
     study = load_study(config | own, origin)
-    return study.run_config(environment, "ppo", 0)
+    return study.run_config(name, "ppo", 0)
 
 
 def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
@@ -42,16 +43,7 @@ def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
 
     `ConfigError` if the environment cannot be made with these arguments.
     """
-    arguments: dict[str, Any] = config.environment_arguments
-    try:
-        env = gymnasium.make(
-            config.environment, max_episode_steps=config.max_episode_steps, **arguments
-        )
-        for place, (reference, own) in enumerate(config.wrappers):
-            env = make(reference, f"environment_wrappers.{place}", gymnasium.Env, False, env, **own)
-    except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{config.environment} cannot be made: {reason}") from error
+    env: gymnasium.Env[Any, Any] = environment(config, Streams(0)).env
     env.action_space.seed(0)
     env.reset(seed=0)
     returns = np.zeros(episodes)

@@ -125,7 +125,7 @@ def main() -> None:
             shutil.rmtree(stale)
     outputs = {name: [PAGE] if only else study["outputs"] for name, study in wanted.items()}
     try:
-        runs = sum(kept_runs.unpack(Path(archive), MADE / archive) for archive in archives)
+        runs = sum(kept_runs.unpack(Path(archive), MADE / archive, cores) for archive in archives)
         make_all(
             {name: wanted[name] | {"outputs": [*own, TABLES]} for name, own in outputs.items()},
             cores,

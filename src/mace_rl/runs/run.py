@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
@@ -70,7 +70,13 @@ def run(
     directory = directory.absolute()  # an environment may change the current folder
     directory.mkdir(parents=True, exist_ok=True)
     own = seeded(Streams(config.seed).sequence("global"))
-    with exclusive(directory) as lock, threadpool_limits(1), single_threaded(), own:
+    with (
+        exclusive(directory) as lock,
+        threadpool_limits(1),
+        single_threaded(),
+        own,
+        ExitStack() as end,
+    ):
         if aside == "nothing" and finished(config, directory):
             if (directory / files.CHECKPOINT).exists():  # of a run killed at its end
                 (directory / files.CHECKPOINT).unlink()
@@ -78,6 +84,7 @@ def run(
         started = time.monotonic()
         identity, code = provenance.identity(config), provenance.git_state()
         trainer = (PublishedTrainer if config.trainer == "published" else Trainer)(config)
+        end.callback(trainer.environment.env.close)
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:
@@ -114,7 +121,6 @@ def run(
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
         file.unlink(missing_ok=True)
-        trainer.environment.env.close()
 
 
 def to_continue(

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,12 @@ from mace_study.measure.metrics import (
     learning_curve,
     metrics_columns,
 )
+
+WANTED = {  # of a metric, by its unit
+    "episodes": "an Attained, at a whole number",
+    "return": "a finite number",
+    "share": "a finite number from 0 to 1",
+}
 
 
 def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
@@ -38,23 +45,22 @@ def metrics_of_run(
     row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
     metrics = all_metrics(settings)
     for metric in metrics:
-        value = metric.function(curve)
-        number = value.number if isinstance(value, Attained) else value
-        real = isinstance(number, Real) and math.isfinite(number)
-        if isinstance(value, Attained) != (metric.unit == "episodes") or not real:
-            kind = "an Attained" if metric.unit == "episodes" else "a finite number"
-        elif isinstance(value, Attained) and number % 1:
-            kind = "an Attained of a whole number"
-        elif metric.unit == "share" and not 0 <= number <= 1:
-            kind = "a share, from 0 to 1"
-        elif isinstance(value, Attained):
-            row |= {metric.name: int(number), metric.flag: int(value.censored)}
-            continue
+        value: Any = metric.function(curve)
+        if not _fits(value, metric.unit):
+            wanted = f"{metric.name} of the run {run} is {value!r}, but should be"
+            raise ConfigError(f"{wanted} {WANTED[metric.unit]}")
+        if metric.unit == "episodes":
+            row |= {metric.name: int(value.number), metric.flag: int(value.censored)}
         else:
-            row[metric.name] = float(number)
-            continue
-        raise ConfigError(f"{metric.name} of the run {run} is {value!r}, but should be {kind}")
+            row[metric.name] = float(value)
     return {name: row[name] for name in metrics_columns(metrics)}
+
+
+def _fits(value: Any, unit: str) -> bool:
+    if unit == "episodes":
+        return isinstance(value, Attained) and value.number % 1 == 0
+    real = isinstance(value, Real) and math.isfinite(value)
+    return bool(real and (unit != "share" or 0 <= float(value) <= 1))
 
 
 def read_metrics(
