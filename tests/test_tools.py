@@ -18,7 +18,7 @@ from benchmarks import bounds, breakdown, guard, page, purejaxrl
 from benchmarks.measuring import CARTPOLE, FILE, HOPPER
 from mace_rl.runs import run
 from mace_study.config.study import read_study
-from tools import kept_runs, random_return, tables
+from tools import detector, kept_runs, random_return, tables, worlds
 from tools.deposit import DepositError, deposit
 
 
@@ -113,6 +113,25 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     assert tabulate("--report", "small")[1].startswith(
         "tables: reference/small/CartPole-v1/ppo.tar"
     )
+
+
+@pytest.mark.parametrize(
+    ("tool", "words", "said"),
+    [
+        (tables, ["--cores", "0"], "--cores is '0', but should be all, or at least 1"),
+        (tables, ["--cores", "two"], "--cores is 'two', but should be all, or at least 1"),
+        (detector, ["--streams", "0"], "--streams is 0, but should be at least 1"),
+        (worlds, ["nowhere"], "worlds: nowhere has no tuned/metrics.csv"),
+    ],
+)
+def test_a_tool_refuses_in_one_line_in_any_folder(
+    monkeypatch, capsys, tmp_path, tool, words, said
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [tool.__name__, *words])
+    with pytest.raises(SystemExit) as ended:
+        tool.main()
+    assert said in f"{capsys.readouterr().err}{ended.value}"
 
 
 # --- random_return --------------------------------------------------------------------------------
