@@ -1,12 +1,14 @@
 """tools/ and benchmarks/: kept tables, random returns, the archive for a DOI, what is measured."""
 
 import importlib
+import json
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,9 +18,10 @@ from shared import ROOT, Bonanza, message
 
 from benchmarks import bounds, breakdown, guard, page, purejaxrl
 from benchmarks.measuring import CARTPOLE, FILE, HOPPER
+from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.runs import run
 from mace_study.config.study import read_study
-from tools import detector, kept_runs, random_return, tables, worlds
+from tools import detector, kept_runs, random_return, schema, tables, worlds
 from tools.deposit import DepositError, deposit
 
 
@@ -27,6 +30,23 @@ def test_the_study_that_make_report_shows_is_kept() -> None:
     named = {*re.findall(r"\(STUDY=(\w+)\)|\$\(STUDY\),(\w+)\)", makefile)}
     studies = yaml.safe_load((ROOT / "reference/studies.yaml").read_text(encoding="utf-8"))
     assert {"".join(pair) for pair in named} == {"tuned"} and "tuned" in studies
+
+
+def test_editors_are_told_what_a_configuration_may_be() -> None:
+    assert json.loads(schema.GOAL.read_text(encoding="utf-8")) == schema.schema()
+    validator = jsonschema.Draft202012Validator(schema.schema())
+    files = [ROOT / "config.yaml", *(ROOT / "config").rglob("*.yaml")]
+    for file in (file for file in files if file.name != "claims.yaml"):
+        assert [*validator.iter_errors(read_yaml(file))] == [], file
+    for wrong in (
+        "seeds=[-1]",
+        "training={ppo: {clp: 0.2}}",
+        "training={novelty: {neighbours: 10}}",
+        "environment_settings={CartPole-v1: {episodes: many}}",
+        "variant_settings={mine: {beta: {kind: metta}}}",
+        "variant_settings={mine: {betta: {kind: meta}}}",
+    ):
+        assert [*validator.iter_errors(read_options([wrong]))], wrong
 
 
 def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
