@@ -74,7 +74,7 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         rows: Any = table.itertuples()
         for row in rows:
             left, height = worlds.index(row.world), heights[list(said).index(row.claim)]
-            colour, _ = OUTCOMES[row.outcome]
+            colour, label = OUTCOMES[row.outcome]
             verdict = row.verdict.replace(" (", "\n(")
             lines = f"{verdict}\n{difference(row.difference, row.low, row.high)}"
             area = (
@@ -82,13 +82,14 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
                 (tops[row.claim] + 0.05,) * 2,
                 (tops[row.claim] + height,) * 2,
             )
-            axes.fill_between(*area, color=colour, alpha=0.25, linewidth=0)
+            axes.fill_between(*area, color=colour, alpha=0.25, linewidth=0, label=label)
             axes.text(left + 0.485, tops[row.claim] + height / 2, lines, ha="center", **small)
         axes.set(xlim=(-1.6, len(worlds)), ylim=(heights.sum(), 0), yticks=[])
         axes.set_xticks(np.arange(len(worlds)) + 0.485, worlds)
         axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False)
         axes.spines[:].set_visible(False)
-        legend(figure, "Number: the part with the smallest p, its difference and 95 % interval.")
+        told = "Number: the part with the smallest p, its difference and 95 % interval."
+        legend(figure, f"{told} Colour: what decides.")
     return figure
 
 
