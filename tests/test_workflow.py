@@ -22,7 +22,7 @@ ENVIRONMENTS, VARIANTS = ["CartPole-v1", "Acrobot-v1"], ["ppo", "mace_fixed", "m
 # Instead of what config.yaml has.
 TINY = {"environments": ENVIRONMENTS, "variants": VARIANTS, "seeds": [0], "  episodes": 4}
 RUNS = [f"runs/{env}/{variant}/seed0" for env in ENVIRONMENTS for variant in VARIANTS]
-TABLES, DRAWN = {"tables": 1, "tables_page": 1}, {"figure": 2, "picture": 1, "readings": 1}
+TABLES, DRAWN = {"tables": 1, "tables_page": 1}, {"figures": 1, "picture": 1, "readings": 1}
 EVALUATION = {"metrics": 1, **TABLES, **DRAWN}
 PAPERS = TABLES | {"table2": 1, "picture": 1, "readings": 1}  # what the paper says is used by
 
@@ -137,7 +137,7 @@ MODES = {  # options, with a file taken away before, and what the last lines the
     "--touch": ("table1.csv", "Not there, and not made now: results/table1.csv"),
     "--until train": (f"{RUNS[0]}/agent.pt", "Not there, and not made now: results/runs/"),
     "--until metrics": (f"{RUNS[0]}/agent.pt", "results/betas.csv, results/metrics.csv"),
-    "--omit-from figure": ("figure1.pdf", "results/table1.tex, results/table2.tex"),
+    "--omit-from figures": ("figure1.pdf", "results/table1.tex, results/table2.tex"),
     "--rerun-triggers mtime": (None, "results/figure1.pdf, results/figure2.pdf"),
     "--batch all=1/2": (None, "results/table1.tex"),
     "--summary": (None, "no update"),

@@ -35,7 +35,7 @@ PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
-    *("metrics", "tables", "table2", "tables_page", "figure", "claims", "picture", "readings"),
+    *("metrics", "tables", "table2", "tables_page", "figures", "claims", "picture", "readings"),
     "page",
 )
 

@@ -2,26 +2,28 @@
 
 
 # Over training: 1 is the paper's, 2 shows β.
-rule figure:
+FIGURES = ["figure1", "figure2"]
+
+
+# In one job, since reading the runs takes as long as drawing them.
+rule figures:
     input:
         episodes=EPISODES,
         records=RECORDS,
     output:
-        curves=shown("figure{number}.csv", "figure"),
-        single_seeds=f"{RESULTS}/figure{{number}}_seeds.csv",
-        pdf=f"{RESULTS}/figure{{number}}.pdf",
-        png=shown("figure{number}.png", "figure"),
+        curves=[shown(f"{figure}.csv", figure) for figure in FIGURES],
+        single_seeds=[f"{RESULTS}/{figure}_seeds.csv" for figure in FIGURES],
+        pdf=[f"{RESULTS}/{figure}.pdf" for figure in FIGURES],
+        png=[shown(f"{figure}.png", figure) for figure in FIGURES],
     log:
-        f"{RESULTS}/logs/figure{{number}}.log",
-    wildcard_constraints:
-        number="1|2",
+        f"{RESULTS}/logs/figures.log",
     params:
         runs=TRAININGS,
         settings=study.metrics.model_dump(exclude={"custom"}),
         style=STYLE,
-        code=code("figure.py"),
+        code=code("figures.py"),
     script:
-        "../scripts/figure.py"
+        "../scripts/figures.py"
 
 
 # Of all runs at once, or of the ledger: `PICTURES` of mace_study.show.pictures.

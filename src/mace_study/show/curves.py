@@ -21,7 +21,7 @@ from mace_study.compare.summary import from_to
 from mace_study.config.metrics import FigureConfig, MetricsConfig
 from mace_study.measure.metrics import metric_labels, moving_average
 
-MAX_POINTS = 500  # per curve: a panel of three in a row has hardly more dots
+MAX_POINTS = 300  # per curve: a panel of three in a row is hardly twice as many dots wide
 DOTS_PER_INCH = 300
 WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 7.2, 2.1, 0.5  # inches; a page's text is about as wide
 LETTERS = 140  # about as many as stand side by side in a legend
@@ -82,8 +82,8 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
     """The curve of every run: the moving average of the `shown` column.
 
     `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
-    is over the last `window` episodes, or over all there are so far. Of E > 500 episodes only every
-    ⌈E / 500⌉-th is kept, counted back from the last: more could not be seen.
+    is over the last `window` episodes, or over all there are so far. Of E > 300 episodes only every
+    ⌈E / 300⌉-th is kept, counted back from the last: more could not be seen.
     Columns: env, variant, seed, episode and the average by its name.
     """
     columns = ["env", "variant", "seed", "episode", shown.name]

@@ -1,6 +1,5 @@
 """A figure for the page: its panels one by one, as SVG that takes the page's colours."""
 
-import math
 import re
 
 import pandas as pd
@@ -13,33 +12,22 @@ WIDTH, HEIGHT = 3.3, 2.5  # inches: letters of a readable size on a phone
 # What figures draw in black (seaborn: almost), light grey and white, in light and in dark.
 PAGE_COLOURS = {"#000000": "currentColor", "#262626": "currentColor"}
 PAGE_COLOURS |= {"#e6e6e6": "var(--line)", "#ffffff": "var(--card)"}
-MAX_POINTS = 250  # per curve: a point for every pixel and a half
 
 
 def panels(
     curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> dict[str, str]:
-    """The panel of each environment, as `draw_figure` draws it of fewer points; no legend."""
+    """The panel of each environment, as `draw_figure` draws it; no legend."""
     drawn: dict[str, str] = {}
     for environment, own in curves.groupby("env", sort=False):
         seeds = single_seeds[single_seeds["env"] == environment]
         alone = look._replace(layout=FigureConfig(columns=1))
-        figure = draw_figure(_thinned(own), _thinned(seeds), shown, alone)
+        figure = draw_figure(own, seeds, shown, alone)
         for legend in figure.legends:
             legend.remove()
         figure.set_size_inches(WIDTH, HEIGHT)
         drawn[str(environment)] = svg(figure, f"{shown.name}-{len(drawn)}", str(environment))
     return drawn
-
-
-def _thinned(frame: pd.DataFrame) -> pd.DataFrame:
-    """Fewer points of each variant: variants may have different episodes."""
-
-    def kept(episodes: pd.Series) -> pd.Series:
-        own = sorted(episodes.unique())
-        return episodes.isin(own[:: -math.ceil(len(own) / MAX_POINTS)])
-
-    return frame[frame.groupby("variant")["episode"].transform(kept)]
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
