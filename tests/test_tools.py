@@ -1,6 +1,5 @@
-"""tools/ and benchmarks/: kept tables, random returns, the archive for a DOI, what is measured."""
+"""tools/: kept tables, the schema, random returns, the archive for a DOI."""
 
-import importlib
 import json
 import re
 import shutil
@@ -8,16 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 from PIL import Image
 from shared import ROOT, Bonanza, message
+from snakemake.exceptions import WorkflowError
+from snakemake.utils import validate
 
-from benchmarks import bounds, breakdown, guard, page, purejaxrl
-from benchmarks.measuring import CARTPOLE, FILE, HOPPER
 from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.runs import run
 from mace_study.config.study import read_study
@@ -33,11 +31,12 @@ def test_the_study_that_make_report_shows_is_kept() -> None:
 
 
 def test_editors_are_told_what_a_configuration_may_be() -> None:
-    assert json.loads(schema.GOAL.read_text(encoding="utf-8")) == schema.schema()
-    validator = jsonschema.Draft202012Validator(schema.schema())
+    """By Snakemake's check of a schema."""
+    kept = json.loads(schema.GOAL.read_text(encoding="utf-8"))
+    assert kept == schema.schema(), "python -m tools.schema makes it anew"
     files = [ROOT / "config.yaml", *(ROOT / "config").rglob("*.yaml")]
     for file in (file for file in files if file.name != "claims.yaml"):
-        assert [*validator.iter_errors(read_yaml(file))] == [], file
+        validate(read_yaml(file), str(schema.GOAL))
     for wrong in (
         "seeds=[-1]",
         "training={ppo: {clp: 0.2}}",
@@ -46,7 +45,8 @@ def test_editors_are_told_what_a_configuration_may_be() -> None:
         "variant_settings={mine: {beta: {kind: metta}}}",
         "variant_settings={mine: {betta: {kind: meta}}}",
     ):
-        assert [*validator.iter_errors(read_options([wrong]))], wrong
+        with pytest.raises(WorkflowError, match="Error validating"):
+            validate(read_options([wrong]), str(schema.GOAL))
 
 
 def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
@@ -257,117 +257,3 @@ def test_what_is_not_committed_is_refused(clone, change):
     (clone / change).write_text("changed")
     with pytest.raises(DepositError, match=rf"^not committed: .*{change}\W*$"):
         deposit(clone)
-
-
-# --- benchmarks -----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("environment", [CARTPOLE, HOPPER])
-@pytest.mark.parametrize("variant", ["ppo", "mace_full"])
-def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, environment, variant):
-    from mace_rl.training.trainer import Trainer
-
-    for _, module, name in breakdown.FUNCTIONS:  # put back after the test
-        owner = importlib.import_module(module)
-        monkeypatch.setattr(owner, name, getattr(owner, name))
-    known = {} if variant == "ppo" else {"novelty": {"refresh_every": 8, "write_every": 1}}
-    config = run_config(environment, variant, episodes=12, **known)
-    plain, profiled = Trainer(config), Trainer(config)
-    assert len(list(plain.run())) == 12
-    watch = breakdown.Stopwatch("bookkeeping")
-    breakdown.instrument(profiled, watch)
-    assert len(list(profiled.run())) == 12
-    assert profiled.records == plain.records
-    expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
-    assert watch.stop().keys() == expected.keys()
-
-
-def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatch):
-    """One update an episode: four epochs of both networks, which see four numbers."""
-    from mace_rl.training.trainer import Trainer
-
-    owners = ("update_policy", "update_critic", "policy_gradients")
-    for owner, name in (
-        *((bounds.compiled_learner, name) for name in owners),
-        *((bounds.CompiledMLP, name) for name in ("forward", "outputs", "backward")),
-        (bounds.Neighbours, "nearest"),
-    ):  # put back after the test
-        monkeypatch.setattr(owner, name, getattr(owner, name))
-    config = run_config("CartPole-v1", "ppo", episodes=3)
-    plain, counted, work = Trainer(config), Trainer(config), bounds.Work()
-    assert len(list(plain.run())) == 3
-    work.watch(counted)
-    assert len(list(counted.run())) == 3
-    assert counted.records == plain.records
-    steps = plain.records[-1].env_steps
-    weights = 4 * 64 + 64 * 64 + 64 * 16  # in products: outputs are filled up to 16
-    inward = 2 * 64 * 64 + 64 * 2 + 64 * 1  # gradients of the hidden layers, of two logits, a value
-    acting_and_values = steps + steps + 3  # the critic sees an episode's last state, too
-    narrow = 2 * 16 - 2 - 1  # columns that the gradient of the last weights does not fill up
-    each = 4 * weights + inward - 64 * narrow  # of both networks: forward, gradients of weights
-    expected = 2 * (weights * acting_and_values + 4 * steps * each)
-    assert work.operations == expected
-    assert work.bytes > 0
-
-
-def test_purejaxrl_s_training_imports_nothing_but_what_its_environment_has():
-    script = Path(purejaxrl.__file__).with_name("purejaxrl_training.py")
-    command = [sys.executable, "-I", "-S", str(script), "folder", "{}", "0"]
-    said = subprocess.run(command, capture_output=True, text=True).stderr
-    assert said.splitlines()[-1] == "ModuleNotFoundError: No module named 'jax'"
-
-
-@pytest.mark.slow
-def test_purejaxrl_trains():
-    """For real: in its environment, which is made first (800 MB), two updates of its own size."""
-    try:
-        purejaxrl.set_up()
-    except purejaxrl.LeftOut as reason:
-        pytest.skip(str(reason))  # where neither GitHub nor a clone, or no index, can be reached
-    given = purejaxrl.configuration("purejaxrl_4x128", CARTPOLE, 2 * 4 * 128)
-    reading = purejaxrl.train(given, seed=0)
-    assert reading["steps"] == 1024
-    assert 0 < reading["cpu_seconds"] < 60 and reading["seconds"] > 0
-    assert reading["note"].startswith("jax 0.10.2, jaxlib 0.10.2, flax ")
-
-
-def test_the_page_of_measurements_is_what_they_say(tmp_path):
-    """Every section of it."""
-    kept = ROOT / "benchmarks"
-    shutil.copy(kept / FILE, tmp_path)
-    assert page.write(tmp_path).read_text() == (kept / "README.md").read_text()
-
-
-def test_the_guard_s_ratios_are_of_pairs(monkeypatch):
-    now, before = Path("now"), Path("before")
-    slower = {1000: 1.1, 1001: 1.3, 1002: 0.9}  # by seed, which each pair has of its own
-    slower[1003] = 9.0  # of the reading that compiles
-
-    def read(tree, who, env, seed, steps):
-        asked.append((tree, seed))
-        return 10.0 * (seed - 999) * (slower[seed] if tree == now else 1.0)
-
-    asked = []
-    monkeypatch.setattr(guard, "microseconds", read)
-    found = guard.compare(before, now, CARTPOLE, "ppo", 3, 99)
-    assert asked[:4] == [(before, 1003), (now, 1003), (before, 1000), (now, 1000)]
-    assert asked[4:6] == [(now, 1001), (before, 1001)]
-    assert guard.row(CARTPOLE, "ppo", found) == (
-        "| CartPole-v1 `ppo` | 20.0 | 26.0 | 1.10 (0.90 to 1.30) |"
-    )
-
-
-def test_the_guard_counts_between_two_numbers_of_steps(monkeypatch):
-    def run_in(tree, command, **more):
-        steps = int(command[-1]) + 3  # whole episodes
-        count = f"==7== I   refs:      {10**9 + 1234 * steps:,}" * (command[0] == "valgrind")
-        return subprocess.CompletedProcess(command, 0, f"{steps}\n", count)
-
-    monkeypatch.setattr(guard, "run_in", run_in)
-    assert guard.instructions(ROOT, "ppo", CARTPOLE) == 1234
-
-
-@pytest.mark.slow
-def test_the_guard_reads_a_training_of_a_tree():
-    assert 1 < guard.microseconds(ROOT, "ppo", CARTPOLE, 1000, 2048) < 10_000
