@@ -27,7 +27,7 @@ def play(environment: Environment) -> Episode:
     [
         ({}, None, "has no time limit .*set one"),
         ({}, 10**9, "has a time limit of 1000000000 .*set one of 1 to 1000000"),
-        ({"observation_space": Text(3)}, 10, "the observation is of Text.*, or by --wrapper"),
+        ({"observation_space": Text(3)}, 10, "the observation is of Text.*, --wrapper without"),
         ({"observation_space": Box(0, 9, (84, 84, 4), np.uint8)}, 10, "has 28224 numbers"),
         ({"action_space": MultiDiscrete([2, 2])}, 10, "Discrete and one-dim"),
         ({"action_space": Box(-1, 1, (2, 2))}, 10, "Discrete and one-dim"),

@@ -127,7 +127,9 @@ def test_wrappers_go_around_the_environment_in_order(run_config):
     [
         ("test_minigrid:Halve", ["has no 'Halve'"]),
         ("no_module:Halved", ["no Python module 'no_module'"]),
-        ("test_minigrid:Spaces", ["a subclass of gymnasium.core.Env"]),
+        ("test_minigrid:Spaces", ["a subclass of gymnasium.core.Wrapper"]),
+        # An environment and no wrapper: it would be played in place of the one that is named.
+        ("gymnasium.envs.classic_control:AcrobotEnv", ["a subclass of gymnasium.core.Wrapper"]),
         ({"wrapper": "test_minigrid:Halved", "arguments": {"part": 1}}, ["unexpected", "part"]),
     ],
 )
@@ -136,6 +138,75 @@ def test_a_wrapper_that_cannot_be_made_gets_one_line(wrapper, words):
         Trainer(settings("CartPole-v1", "ppo", environment_wrappers=[wrapper]))
     said = str(refused.value)
     assert all(word in said for word in words) and "\n" not in said
+
+
+class Forgetful(gymnasium.Wrapper):
+    """It does not say what it wraps."""
+
+    def __init__(self, env):
+        self.wrapped = env
+
+
+class Failing(gymnasium.RewardWrapper):
+    """Its own mistake."""
+
+    def reward(self, reward):
+        return {}[reward]
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "error", "said"),
+    [
+        ("test_minigrid:Forgetful", ConfigError, "^environment 'CartPole-v1': AttributeError: "),
+        ("test_minigrid:Failing", KeyError, r"^1.0\nin step 1 of an episode of CartPole"),
+    ],
+)
+def test_a_wrapper_s_mistake_is_said_to_be_that(wrapper, error, said):
+    with pytest.raises(error, match=said):
+        list(Trainer(settings("CartPole-v1", "ppo", environment_wrappers=[wrapper])).run())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x = (", r"SyntaxError: '\(' was never closed"),
+        ("None.x", r"AttributeError: .*no attribute 'x' \(.*{module}.py:1\)"),
+        ("raise SystemExit(3)", r"SystemExit: 3 \(.*{module}.py:1\)"),
+    ],
+)
+def test_a_module_that_cannot_be_imported_gets_one_line(text, said, tmp_path, monkeypatch, request):
+    module = f"broken_{request.node.callspec.indices['text']}"
+    (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=said.replace("{module}", module)) as refused:
+        settings(f"{module}:X-v0", "ppo")
+    assert "\n" not in str(refused.value)
+
+
+PARTS = Dict({"a": MultiDiscrete([3, 4]), "b": Box(0, 9, (2,), np.int8)})
+
+
+@pytest.mark.parametrize(
+    ("space", "fits", "others"),
+    [
+        (PIXELS, PIXELS.sample() * 1.0, [PIXELS.sample() / 256 + 0.1]),
+        (MultiBinary(3), [1, 0, 1], [[0.5, 0, 1]]),
+        (MultiDiscrete([3, 4]), [2, 3], [[2, 4], [2], [0.5, 1]]),
+        (
+            PARTS,
+            {"a": [0, 0], "b": [1.0, 2]},
+            [{"a": [0, 0]}, {"a": [0, 0], "b": [1, 2.5]}, {"a": [0, 0], "b": np.array([1, 257])}],
+        ),
+    ],
+)
+def test_whole_numbers_are_whole_in_every_part(space, fits, others):
+    """A fraction would be new at each visit, or be cut off in silence."""
+    spaces = Spaces("x", space, Discrete(2))
+    flat = gymnasium.spaces.flatten(space, space.sample())
+    assert spaces.encode(fits).shape == flat.shape
+    for other in others:
+        with pytest.raises(ConfigError, match=r"gave the observation .* but its "):
+            spaces.encode(other)
 
 
 def test_a_text_is_refused_with_the_way_out_and_left_out_of_the_wrapper_s_bonus():

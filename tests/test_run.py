@@ -47,12 +47,19 @@ def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
     config, directory = run_config(**settings), trained(**settings)
     assert files(directory) == RESULTS
     trainer = finish(config)
-    frames = read_runs([str(directory / "run.json")], [("CartPole-v1", "mace_full", 0, 5)])
-    frame = frames["CartPole-v1", "mace_full", 0]
+    record, run = [str(directory / "run.json")], ("CartPole-v1", "mace_full", 0)
+    of_study = {run[:2]: config.settings() | {"seed": 7}}
+    frame = read_runs(record, [(*run, 5)], of_study)[run]
     assert frame.to_dict("records") == [vars(record) for record in trainer.records]
-    for other in (("CartPole-v1", "ppo", 0), ("CartPole-v1", "mace_full", 1)):
-        with pytest.raises(RecordError, match=r"run\.json: it is of CartPole-v1 mace_full 0, not"):
-            read_runs([str(directory / "run.json")], [(*other, 5)])
+    ppo = run_config(variant="ppo", episodes=5).settings()
+    sharp = config.settings() | {"ppo": config.settings()["ppo"] | {"clip": 0.3}}
+    for seed, settings_, said in [
+        (1, config.settings(), "seed was 0 and is 1"),
+        (0, ppo, "variant was 'mace_full' and is 'ppo'"),
+        (0, sharp, "ppo.clip was 0.2 and is 0.3"),
+    ]:
+        with pytest.raises(RecordError, match=rf"run\.json is of another run: {said}"):
+            read_runs(record, [(*run[:2], seed, 5)], {run[:2]: settings_})
     frame = pd.read_csv(directory / "diagnostics.csv")
     expected = [vars(record) for record in trainer.diagnostics]
     np.testing.assert_equal(frame.to_dict("records"), expected)

@@ -158,5 +158,9 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     assert found == [("tuned", "18", "4"), ("published", "6", "1")] * 2  # by both rules
     assert set(pd.read_csv(tmp_path / "worlds/verdicts.csv")["world"]) == {"published"}
     assert set(pd.read_csv(tmp_path / "worlds/draws.csv")["world"]) == {"tuned", "published"}
+    whole = pd.read_csv(tmp_path / "published/metrics.csv")
+    whole[:-1].to_csv(tmp_path / "published/metrics.csv", index=False)
+    said = message(monkeypatch, worlds, str(tmp_path))
+    assert "published/metrics.csv: the runs of Acrobot-v1 are not complete: " in said
     said = message(monkeypatch, worlds, str(tmp_path / "tuned"))
     assert said.startswith(f"worlds: {tmp_path / 'tuned'} has no tuned/metrics.csv")

@@ -56,6 +56,7 @@ metrics: {confidence: 95}  # metrics.confidence, 95, less than 1
 metrics: {bootstrap_repetitions: 99}  # metrics.bootstrap_repetitions, 99, 100
 metrics: {random_return: {CartPole-v1: .nan}}  # metrics.random_return.CartPole-v1, nan, finite
 metrics: {constants: {learned: mace_full, fixed: []}}  # metrics.constants.fixed, [], 1 item
+metrics: {constants: {learned: mace_full, fixed: [nix]}}  # metrics.constants, 'nix'
 metrics: {constants: {learned: ppo, fixed: [ppo]}}  # metrics, constants.fixed, learned, 'ppo'
 metrics: DELETE  # 'metrics', missing
 training: {ppo: {clip: DELETE}}  # training, 'ppo.clip', missing

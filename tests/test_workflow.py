@@ -227,6 +227,8 @@ def test_a_damaged_result_is_named_on_the_terminal(finished: Project) -> None:
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
         ("--configfile config.yaml --configfiles config.yaml", "--configfile is there 2 times"),
         ("--config seeds=[0] -C variants=[ppo]", "--config is there 2 times"),
+        ("--config seeds", "--config has 'seeds', but should have KEY=VALUE"),
+        ("--config metrics.threshold=1", "--config has 'metrics.threshold=1', but should have"),
     ],
 )
 def test_mistakes_end_in_one_line(finished: Project, options: str, expected: str) -> None:
@@ -259,6 +261,26 @@ def test_success_removes_the_checkpoints_of_finished_runs_alone(finished: Projec
     code, output = finished("snakemake part/table2.tex --config results=part")
     assert code == 0, output
     assert not (done / "checkpoint.pt").exists() and (unfinished / "checkpoint.pt").exists()
+
+
+def test_runs_from_elsewhere_are_taken_if_they_are_this_study_s(finished: Project) -> None:
+    """Snakemake knows nothing of them. The last line names the same folder."""
+    shutil.copytree(finished["results/runs"], finished["copied/runs"])
+    code, output = finished("snakemake copied/tables.md --config results=copied")
+    assert code == 0 and "train" not in re.findall(r"^(\w+) +\d", output, re.MULTILINE), output
+    assert output.splitlines()[-1].endswith("page: snakemake page --config results=copied")
+    shutil.rmtree(finished["copied/runs"])
+    shutil.copytree(finished["results/runs"], finished["other/runs"])
+    changed = "results=other 'training={ppo: {clip: 0.3}}'"
+    code, output = finished(f"snakemake other/metrics.csv --config {changed}")
+    assert code == 1 and f"other/{RUNS[0]}/run.json is of another run: ppo.clip was 0.2" in output
+
+
+def test_another_config_yaml_where_snakemake_starts_is_not_read(finished: Project) -> None:
+    finished["elsewhere"].mkdir()
+    finished["elsewhere/config.yaml"].write_text("- a")
+    code, output = finished("sh -c 'cd elsewhere && snakemake -s ../Snakefile -n ../results/x'")
+    assert code == 1 and "config.yaml" not in output and "MissingRuleException" in output
 
 
 def test_the_same_command_after_it_was_interrupted_killed_and_ended(finished: Project) -> None:

@@ -7,7 +7,17 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Text, Tuple, flatdim, flatten
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    MultiBinary,
+    MultiDiscrete,
+    Text,
+    Tuple,
+    flatdim,
+    flatten,
+)
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
@@ -346,7 +356,7 @@ NO_MODE.metadata = {}
     ("form", "given", "error", "message"),
     [
         (CuriosityReward, [observing([], Text(3))], ConfigError, "the observation is of Text"),
-        (CuriosityReward, [TWO_ACTIONS], ConfigError, "has actions MultiD"),
+        (CuriosityReward, [TWO_ACTIONS], ConfigError, "has actions MultiD.*ActionWrapper"),
         # stable-baselines3's are none of Gymnasium's.
         (CuriosityReward, [make_vec_env("CartPole-v1", 2)], TypeError, "Expected env to be"),
         (VectorCuriosityReward, [PAIR, BANDIT], ConfigError, "Bandit.*2 go on at once"),
@@ -360,6 +370,19 @@ def test_what_cannot_be_wrapped(form, given, error, message):
 
 GOOD, THREE = np.zeros(4, np.float32), Discrete(3, start=5)
 BAD = [GOOD + np.inf] * 99
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (CuriosityReward(observing([], MultiBinary(4))).state_dict(), r"space 'MultiBinary\(4\)'"),
+        (CuriosityReward(observing([], THREE)).state_dict(), "made with observation_s"),
+        *((other, "not one of `state_dict`") for other in ({}, None, 5)),
+    ],
+)
+def test_a_state_of_something_else_is_refused(state, message):
+    with pytest.raises(ConfigError, match=message):
+        CuriosityReward(gymnasium.make("CartPole-v1")).load_state_dict(state)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ paper's Table 1 as a draw, and their pictures.
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from mace_rl.base.errors import Refusal
+from mace_rl.training.records import RecordError
 from mace_study.compare.claims_config import read_claims
 from mace_study.compare.ledger import read_ledger
 from mace_study.compare.single_seeds import draw, numbers
@@ -45,7 +47,7 @@ def make(folder: Path) -> list[str]:
     there = [world for world in WORLDS if (folder / world / "metrics.csv").exists()]
     if not there:
         return []
-    runs = {world: pd.read_csv(folder / world / "metrics.csv") for world in there}
+    runs = {world: _runs(folder / world / "metrics.csv", table1.variants) for world in there}
     curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in there}
     ledgers = {world: folder / world / "claims.json" for world in there}
     answers = {world: read_ledger(path) for world, path in ledgers.items() if path.exists()}
@@ -159,6 +161,17 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     )
     sections.append(Section("The table as a draw", note, pd.DataFrame(rows, columns=columns)))
     return sections
+
+
+def _runs(path: Path, variants: Iterable[str]) -> pd.DataFrame:
+    """A metrics.csv; `RecordError` unless each environment has as many runs of all `variants`."""
+    table = pd.read_csv(path)
+    for environment, own in table.groupby("env"):
+        counts = own["variant"].value_counts().reindex([*variants], fill_value=0)
+        if counts.nunique() > 1 or not counts.iloc[0]:
+            found = ", ".join(f"{count} of {name}" for name, count in counts.items())
+            raise RecordError(f"{path}: the runs of {environment} are not complete: {found}")
+    return table
 
 
 def main() -> None:

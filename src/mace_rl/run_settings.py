@@ -228,10 +228,10 @@ def _with_time_limit(config: RunConfig, spec: EnvSpec) -> RunConfig:
         env = gymnasium.make(spec, disable_env_checker=True, **config.environment_arguments)
         limit = getattr(env.unwrapped, "max_steps", None)
         env.close()
-    if not isinstance(limit, int):
+    if not isinstance(limit, Integral) or isinstance(limit, bool):
         raise ConfigError(
             f"environment has {name!r}, which has no time limit of its own, so that its episodes "
             f"need not end: --max-episode-steps or environment_settings.{name}.max_episode_steps "
             "should set one"
         )
-    return config.model_copy(update={"max_episode_steps": limit})
+    return config.model_copy(update={"max_episode_steps": int(limit)})

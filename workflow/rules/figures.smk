@@ -19,6 +19,7 @@ rule figures:
         f"{RESULTS}/logs/figures.log",
     params:
         runs=TRAININGS,
+        run_settings=RUN_SETTINGS,
         settings=study.metrics.model_dump(exclude={"custom"}),
         style=STYLE,
         code=code("figures.py"),
@@ -64,6 +65,7 @@ rule readings:
         f"{RESULTS}/logs/readings.log",
     params:
         **RUNS_MEASURED,
+        run_settings=RUN_SETTINGS,
         style=STYLE,
         code=code("readings.py", MEASURED),
     script:

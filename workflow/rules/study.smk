@@ -63,15 +63,22 @@ FEWEST_OF_A_STUDY = min(
 # Those that the configuration has the numbers for.
 DRAWN = {"constants": MEASURED.constants, "solved": MEASURED.solved_return, "forest": LEDGER}
 PICTURES = ["every_seed", *(picture for picture, numbers in DRAWN.items() if numbers)]
-# How the study is carried out, for what tells where it comes from. Where its results are is no part.
-GIVEN = [option for option in options if not option.startswith("results=")]
-COMMAND = ["snakemake", "all"]
-COMMAND += ["--configfile", *config_files[1:]] if config_files[1:] else []
-COMMAND += ["--config", *GIVEN] if GIVEN else []
-COMMAND = shlex.join(COMMAND)
-TRAININGS = [(*run, study.run_config(*run).episodes) for run in RUNS]  # with how many episodes
+# By environment and variant, whatever the seed.
+RUN_SETTINGS = {run[:2]: study.run_config(*run).settings() for run in RUNS}
+TRAININGS = [(*run, RUN_SETTINGS[run[:2]]["episodes"]) for run in RUNS]
 RUNS_MEASURED = {"runs": TRAININGS, "settings": MEASURED.model_dump()}
 STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours": study.colours}
+
+
+def command(*words, options=options):
+    """Snakemake's, for this study."""
+    found = ["snakemake", *words]
+    found += ["--configfile", *config_files[1:]] if config_files[1:] else []
+    return shlex.join([*found, "--config", *options] if options else found)
+
+
+# How the study is carried out, for what tells where it comes from. Where its results are is no part.
+COMMAND = command("all", options=[one for one in options if not one.startswith("results=")])
 
 
 def csv(*names):

@@ -13,6 +13,7 @@ rule metrics:
         f"{RESULTS}/logs/metrics.log",
     params:
         **RUNS_MEASURED,
+        run_settings=RUN_SETTINGS,
         code=code("metrics.py", MEASURED),
     script:
         "../scripts/metrics.py"

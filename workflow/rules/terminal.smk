@@ -88,8 +88,8 @@ def outcome():
         lines.append(f"Not there, and not made now: {missing[0]}{more}")
     if f"{RESULTS}/tables.md" in made and f"{RESULTS}/report.html" not in made:
         here = os.path.realpath("Snakefile") == os.path.realpath(workflow.main_snakefile)
-        where = "" if here else f" -s {shlex.quote(os.path.relpath(workflow.main_snakefile))}"
-        lines.append(f"All of it on one page: {COMMAND.replace(' all', f'{where} page', 1)}")
+        where = [] if here else ["-s", os.path.relpath(workflow.main_snakefile)]
+        lines.append(f"All of it on one page: {command(*where, 'page')}")
     return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from mace_study.show import curves
 with job(snakemake):
     given, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(given.settings)
-    frames = read_runs(snakemake.input.records, given.runs)
+    frames = read_runs(snakemake.input.records, given.runs, given.run_settings)
     files = zip(output.curves, output.single_seeds, output.pdf, output.png, strict=True)
     for of_means, of_seeds, *pictures in files:
         number = Path(of_means).stem.removeprefix("figure")

@@ -9,7 +9,8 @@ from mace_study.measure.betas import betas_table
 from mace_study.measure.metrics_csv import metrics_table
 
 with job(snakemake):
-    settings = MetricsConfig.model_validate(snakemake.params.settings)
-    runs = read_runs(snakemake.input.records, snakemake.params.runs)
+    given = snakemake.params
+    settings = MetricsConfig.model_validate(given.settings)
+    runs = read_runs(snakemake.input.records, given.runs, given.run_settings)
     for path, table in zip(snakemake.output, (metrics_table, betas_table), strict=True):
         write_atomically(path, table(runs, settings).to_csv(index=False))

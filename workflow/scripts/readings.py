@@ -12,7 +12,7 @@ from mace_study.show import curves, pictures
 with job(snakemake):
     found, given, output = snakemake.input, snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(given.settings)
-    runs = read_runs(found.records, given.runs)
+    runs = read_runs(found.records, given.runs, given.run_settings)
     table = readings(runs, settings, parse_claims(found.claims).table1)
     write_atomically(output.data, table.to_csv(index=False))
     figure = pictures.draw_readings(table, curves.plot_style(settings, **given.style))

@@ -11,6 +11,7 @@ from mace_rl.config.section import ConfigError
 def checked() -> argparse.Namespace:
     """The `cores` and `configfile` of the command; exits with one line where they are wrong."""
     parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--snakefile", "-s", default="Snakefile")
     parser.add_argument("--cores", "-c", nargs="?", const="all")
     parser.add_argument("--jobs", "-j", nargs="?", const="all")
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="append", default=[])
@@ -23,7 +24,7 @@ def checked() -> argparse.Namespace:
             if len(once) > 1:  # Snakemake reads the last alone
                 raise ConfigError(f"--{option} is there {len(once)} times: give one all its values")
             setattr(given, option, [value for values in once for value in values])
-        for file in [*Path().glob("config.yaml"), *given.configfile]:
+        for file in [*Path(given.snakefile).parent.glob("config.yaml"), *given.configfile]:
             read_yaml(Path(file))
         read_options(given.config)
         if given.cores and given.jobs and given.cores != given.jobs:

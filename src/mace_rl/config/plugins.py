@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
+from mace_rl.base.errors import in_one_line
 from mace_rl.config.section import ConfigError, short_repr
 
 
@@ -85,9 +86,9 @@ def import_module(reference: str, key: str) -> ModuleType:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError(f"{module!r} is no module's name")
         return importlib.import_module(module)
-    except (ImportError, SystemExit) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from None
+    except (Exception, SystemExit) as error:
+        reason = in_one_line(error)
+        raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from error
 
 
 def source_files(reference: str, key: str) -> list[Path]:

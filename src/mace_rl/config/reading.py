@@ -33,7 +33,9 @@ def read_options(options: Iterable[str]) -> Settings:
     """The settings in `--config KEY=VALUE ...`, read as in a file; texts stay as typed."""
     settings: Settings = {}
     for option in options:
-        key, _, text = option.partition("=")
+        key, given, text = option.partition("=")
+        if not given or not re.fullmatch(r"[A-Za-z_]\w*", key):
+            raise ConfigError(f"--config has {option!r}, but should have KEY=VALUE")
         value = _read(text, f"--config {key}")
         plain = isinstance(value, str) and text.lstrip()[0] not in "\"'"
         settings = merge(settings, {key: text if plain else value})

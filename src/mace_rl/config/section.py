@@ -99,9 +99,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """`repr` of a value, cut to 60 characters."""
+    """`repr` of a value, in one line and cut to 60 characters."""
     try:
-        text = repr(value)
+        text = " ".join(repr(value).split())
     except ValueError:  # more digits than Python writes
         text = f"too large: {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."

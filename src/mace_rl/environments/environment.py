@@ -3,7 +3,6 @@
 import copy
 import os
 import sys
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -12,6 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from mace_rl.base.errors import in_one_line, raised_in
 from mace_rl.base.stdio import keep_open
 from mace_rl.config.plugins import import_module, make
 from mace_rl.config.section import ConfigError, short_repr
@@ -20,6 +20,8 @@ from mace_rl.environments.spaces import Spaces
 
 # Faster classes that behave the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
+# Where what a step returned is taken apart.
+UNPACKS = (__name__, "gymnasium.core", "gymnasium.wrappers")
 MOST_STEPS = 10**6  # of an episode; its noise is drawn before it ...
 MOST_NOISE = 10**8  # ... with so many numbers at most
 
@@ -55,10 +57,7 @@ def trying_out(what: str) -> Iterator[None]:
         reason = f"{what} needs a package that should be installed: {error}"
         raise ConfigError(" ".join(reason.split())) from None
     except (Exception, SystemExit) as error:
-        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
-        place = "" if frame.f_globals is globals() else f" ({frame.f_code.co_filename}:{line})"
-        reason = f"{what}: {type(error).__name__}: {error}{place}"
-        raise ConfigError(" ".join(reason.split())) from error
+        raise ConfigError(f"{what}: {in_one_line(error)}") from error
 
 
 class Environment(Spaces):
@@ -100,8 +99,9 @@ class Environment(Spaces):
             self.env = gymnasium.make(spec, disable_env_checker=True, **(arguments or {}))
             for place, (reference, own) in enumerate(wrappers):
                 key = f"environment_wrappers.{place}"
-                self.env = make(reference, key, gymnasium.Env, False, self.env, **own)
-        super().__init__(name, self.env.observation_space, self.env.action_space)
+                self.env = make(reference, key, gymnasium.Wrapper, False, self.env, **own)
+            spaces = self.env.observation_space, self.env.action_space
+        super().__init__(name, *spaces)
         if isinstance(self.action_space, Box) and self.action_space.dtype.kind != "f":
             raise ConfigError(
                 f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "
@@ -140,8 +140,8 @@ class Environment(Spaces):
         try:
             observation, reward, terminated, truncated, _ = self.env.step(action)
         except Exception as error:
-            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-            if frame.f_globals["__name__"].startswith((__name__, "gymnasium.wrappers")):
+            frame, _ = raised_in(error)
+            if "unpack" in str(error) and frame.f_globals["__name__"].startswith(UNPACKS):
                 raise ConfigError(
                     f"environment {self.name!r}, step {number}: not (observation, reward, "
                     f"terminated, truncated, info): {error}"

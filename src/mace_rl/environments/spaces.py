@@ -44,13 +44,14 @@ class Spaces:
         if not (box or isinstance(actions, Discrete)):
             raise ConfigError(
                 f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box "
-                "work, of which gymnasium.wrappers.TransformAction makes others"
+                "work, of which a gymnasium.ActionWrapper of yours makes others"
             )
         require_size(name, actions)
         assert isinstance(observations, Box | Discrete) and isinstance(actions, Box | Discrete)
         self.name = name
         self.observation_space, self.action_space = observations, actions
         self.discrete_observations = isinstance(observations, Discrete)
+        self.whole = is_discrete(self.given_space)
         self.observation_size = int(gymnasium.spaces.flatdim(observations))
         self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
 
@@ -68,7 +69,7 @@ class Spaces:
                 vector = np.zeros(self.observation_size, np.float32)
                 vector[place] = 1.0
                 return vector
-        elif given.size == self.observation_size and given.dtype.kind in NUMBERS:
+        elif self._is_vector(given):
             vector = given.ravel()
             if vector.dtype.kind != "f":
                 vector = vector.astype(np.float32)
@@ -78,10 +79,16 @@ class Spaces:
             if not all_below(vector, TOO_LARGE):
                 require_finite("the observation", given.astype(float), _after(step), TOO_LARGE)
             return vector
+        shape = "" if self.composite else f" of shape {given.shape}"
         raise ConfigError(
-            f"environment {self.name!r} gave the observation {short_repr(observation)} of shape "
-            f"{given.shape}{_after(step)}, but its observation_space is {self.given_space}"
+            f"environment {self.name!r} gave the observation {short_repr(observation)}{shape}"
+            f"{_after(step)}, but its observation_space is {self.given_space}"
         )
+
+    def _is_vector(self, given: np.ndarray) -> bool:
+        """Whether it has as many numbers as it should, whole ones where the space has these."""
+        fits = given.size == self.observation_size and given.dtype.kind in NUMBERS
+        return fits and not (self.whole and has_fractions(given))
 
     def number(self, what: str, value: Any, step: int) -> float:
         """A reward or flag of a step, counted from 1; `ConfigError` unless it is one number."""
@@ -108,10 +115,11 @@ def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> Non
             require_flat(name, part, f"{entry}[{key!r}]")
     elif not isinstance(space, FLAT):
         what = f"the observation{entry} is of {type(space).__name__}"
+        leaves_out = "leaves it out (gymnasium.wrappers:FilterObservation) or " if entry else ""
         raise ConfigError(
-            f"environment {name!r}: {what}, and not so many numbers at every step; name a wrapper "
-            "that leaves it out or makes numbers of it: in environment_wrappers, such as "
-            "gymnasium.wrappers:FilterObservation with its arguments, or by --wrapper without"
+            f"environment {name!r}: {what}, and not so many numbers at every step; it needs a "
+            f"wrapper that {leaves_out}makes numbers of it, which environment_wrappers names with "
+            "its arguments, --wrapper without"
         )
 
 
@@ -165,7 +173,10 @@ def _array(given: Any, composite: gymnasium.Space[Any] | None = None) -> np.ndar
 
 
 def _has_parts(given: Any, space: gymnasium.Space[Any]) -> bool:
-    """Whether each part has its size and each state exists: `flatten` takes -1 for the last."""
+    """Whether each part has its size and whole numbers, and each state exists.
+
+    `flatten` takes the state -1 for the last.
+    """
     match space:
         case Dict():
             return all(_has_parts(given[name], part) for name, part in space.items())
@@ -175,7 +186,19 @@ def _has_parts(given: Any, space: gymnasium.Space[Any]) -> bool:
             return bool(space.start <= given < space.start + space.n)
         case MultiDiscrete():
             return given in space
-    return np.size(given) == gymnasium.spaces.flatdim(space)
+    numbers = np.asarray(given)
+    if is_discrete(space):
+        with np.errstate(invalid="ignore"):  # of NaN
+            if not np.array_equal(numbers, numbers.astype(space.dtype)):
+                return False  # `flatten` would make other numbers of them
+    return numbers.size == gymnasium.spaces.flatdim(space)
+
+
+def has_fractions(numbers: np.ndarray) -> bool:
+    """Whether any of them is finite and not whole."""
+    if numbers.dtype.kind != "f":
+        return False
+    return bool((np.isfinite(numbers) & (numbers != np.trunc(numbers))).any())
 
 
 def _only(values: np.ndarray) -> Any:

@@ -3,14 +3,15 @@
 import csv
 import hashlib
 import io
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl.base import code_digest, files
 from mace_rl.config.plugins import code_outside
-from mace_rl.config.run import IDENTITY, AgentConfig, RunConfig
+from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.runs.provenance import difference, identity, read_record
 from mace_rl.training.records import (
@@ -147,21 +148,25 @@ class FinishedRun:
 
 
 def read_runs(
-    records: Iterable[str], runs: Iterable[tuple[str, str, int, int]]
+    records: Iterable[str],
+    runs: Iterable[tuple[str, str, int, int]],
+    settings: Mapping[tuple[str, str], Mapping[str, Any]],
 ) -> dict[RunKey, "pd.DataFrame"]:
     """The episodes of each run; raises what `FinishedRun.frame` raises.
 
     records: the paths of their `run.json`; runs: their environment, variant, seed and number of
-    episodes. `RecordError` if a record is of another run than its place is for.
+    episodes; settings: `RunConfig.settings` by environment and variant. `RecordError` if a record
+    is of another run, or of one with other settings.
     """
+    plain = {key: json.loads(json.dumps(own)) for key, own in settings.items()}
     found: dict[RunKey, pd.DataFrame] = {}
     for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
-        run, wanted = FinishedRun(Path(record).parent), (environment, variant, seed)
-        own = tuple(run.record["config"][key] for key in IDENTITY)
-        if own != wanted:
-            names = (" ".join(map(str, key)) for key in (own, wanted))
-            raise RecordError("{}: it is of {}, not of {}".format(record, *names))
-        found[wanted] = run.frame(episodes)
+        run = FinishedRun(Path(record).parent, trust=True)  # it is only compared
+        wanted = plain[environment, variant] | {"seed": seed}
+        # The record may lack what is new since, and has a default.
+        if (own := run.record["config"]) != wanted and (own := run.config.settings()) != wanted:
+            raise RecordError(f"{record} is of another run: {difference(own, wanted)}")
+        found[environment, variant, seed] = run.frame(episodes)
     return found
 
 

@@ -2,6 +2,7 @@
 
 import copy
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -154,9 +155,9 @@ class CuriosityTracker(Stateful):
         return {
             **self.config.model_dump(exclude={"seed"}),  # the generators are in the state
             "observation_size": self.spaces.observation_size,
-            "observation_space": type(self.spaces.observation_space).__name__,
+            "observation_space": repr(self.spaces.given_space),
             "environments": len(self.recordings),
-            "form": 8,  # of the state itself
+            "form": 9,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -165,6 +166,8 @@ class CuriosityTracker(Stateful):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `CuriosityReward.load_state_dict` says."""
+        if not isinstance(state, Mapping) or state.keys() != {*self.STATE, "settings"}:
+            raise ConfigError(f"the state to load is {short_repr(state)}, not one of `state_dict`")
         theirs, mine = state["settings"], self.described()
         for name in sorted(theirs.keys() | mine.keys()):
             if name not in theirs or name not in mine or theirs[name] != mine[name]:

@@ -46,7 +46,7 @@ class ReportConfig(Section):
 class Table1Config(Section):
     """The paper's Table 1."""
 
-    caption: str  # the names of its metrics
+    caption: Annotated[str, Field(min_length=1)]  # the names of its metrics
     metrics: Names  # readings of one are the metrics whose names begin with its name
     public_code: list[str] = Field(default=[])  # a reading of each by its rule; or none
     variants: Annotated[dict[str, str], Field(min_length=1)]  # and what the ledger calls them

@@ -58,10 +58,7 @@ def _answers(
         findings = iter(judge(every, table, settings))
         for name, own in parts.items():
             found = [next(findings) for _ in own]
-            outcomes = [finding.outcome for finding in found]
-            answer = verdict(outcomes)
-            if answer == "open" and "no_room" in outcomes and not any(p.has_room for p in found):
-                answer = "no_room"
+            answer = verdict([finding.outcome for finding in found])
             judged[name][how] = Judgement(answer, words[answer], found)
     for name, claim in family.claims.items():
         paper = _in_paper(claim, table1, settings)
@@ -86,7 +83,9 @@ def verdict(outcomes: Sequence[str]) -> str:
         return "shown"
     if "reversed" in found and "shown" not in found:
         return "reversed"
-    return "absent" if found & {"reversed", "absent"} else "open"
+    if found & {"reversed", "absent"}:
+        return "absent"
+    return "open" if "open" in found else "no_room"
 
 
 def find_sized(part: Part, table: pd.DataFrame, settings: MetricsConfig) -> Finding:

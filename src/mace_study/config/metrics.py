@@ -79,7 +79,7 @@ class MetricsConfig(Section):
             missing = [name for name in environments if name not in goal]
             if missing and len(missing) < len(environments):
                 lines.append(f"metrics.{key} is left out: it has nothing for {', '.join(missing)}")
-        missing = [name for name in self._constant_variants() if name not in variants]
+        missing = [name for name in self.constant_variants() if name not in variants]
         if missing:
             lines.append(f"metrics.constants is left out: variants lacks {', '.join(missing)}")
         return lines
@@ -99,11 +99,12 @@ class MetricsConfig(Section):
                         f" metrics.random_return.{name}, {self.random_return[name]!r}"
                     )
             left[key] = left[key] if len(left[key]) == len(environments) else {}
-        if not set(variants).issuperset(self._constant_variants()):
+        if not set(variants).issuperset(self.constant_variants()):
             left["constants"] = None
         return self.model_copy(update=left)
 
-    def _constant_variants(self) -> list[str]:
+    def constant_variants(self) -> list[str]:
+        """Those that the picture of `constants` shows."""
         return [self.constants.learned, *self.constants.fixed] if self.constants else []
 
     def references(self) -> dict[str, str]:

@@ -120,8 +120,12 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
         [(label, count)] = Counter(study.labels.values()).most_common(1)
         if count > 1:
             raise ConfigError(f"{count} variants have the label {label!r}; each needs its own")
-        for variant in itertools.chain.from_iterable(study.metrics.comparisons):
-            check_known(variant, study.variant_settings, "metrics.comparisons", "variant_settings")
+        for key, variants in {
+            "comparisons": itertools.chain.from_iterable(study.metrics.comparisons),
+            "constants": study.metrics.constant_variants(),
+        }.items():
+            for variant in variants:
+                check_known(variant, study.variant_settings, f"metrics.{key}", "variant_settings")
         known = dict.fromkeys([*study.environments, *study.environment_settings])
         for environment, variant in itertools.product(known, study.variant_settings):
             study.run_config(environment, variant, 0)  # checks its settings

@@ -105,7 +105,8 @@ def _means(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> Iterato
     for metric, title in RETURNS.items():
         if metric not in paper.metrics:
             frame = tables.means(supplement, metric, settings)
-            yield Section(title, f"Mean over {seeds} seeds ({interval}).", frame)
+            note = "One seed." if seeds == "1" else f"Mean over {seeds} seeds ({interval})."
+            yield Section(title, note, frame)
     yield Section("Final return of the worst seed", "", tables.worst(runs, settings))
     if "solved" in runs:
         note = f"Seeds whose last episodes are solved in {tables.SOLVED:.0%} of the cases or more."
