@@ -20,6 +20,7 @@ from tools import kept_runs
 PROTOCOLS = {
     "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
+    "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
 }
 WORLDS = {  # what is read over config.yaml
     "tuned": ["worlds/tuned"],
@@ -70,7 +71,7 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", ["tuned", "plain", "published", "tasks"])
+@pytest.mark.parametrize("folder", ["tuned", "plain", "published", "tasks", "minigrid"])
 def test_what_is_kept_has_settings_that_still_load(folder) -> None:
     """Also the names of modules in them: one run of each environment and variant."""
     records = kept(ROOT / "reference" / "worlds" / folder)
