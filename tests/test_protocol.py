@@ -59,7 +59,7 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
     for record in records.values():
         assert not record["code"]["dirty"]
         # A run's sources are also those of the code that it names, such as a rule in extras/.
-        named = ("novelty", "estimator"), ("beta", "rule")
+        named = ("novelty", "estimator"), ("bonus", "estimator"), ("beta", "rule")
         names = tuple(record["config"].get(part, {}).get(key) for part, key in named)
         state = names, record["sources"]
         states.setdefault(record["code"]["commit"], set()).add(state)
