@@ -56,11 +56,11 @@ bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a chan
 	@$(call one_of,BENCH,quick)
 	@$(IN_VENV) $(if $(BENCH),benchmarks.guard,benchmarks)
 
-verify: setup ## repeat some of the twelve short runs, one each of tuned, plain, our tasks: to the bit (SAMPLE=3)
+verify: setup ## repeat some of the twelve short runs, one each of tuned, plain, our tasks, MiniGrid: to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
 	folder=$$(mktemp -d)
 	trap 'rm -rf "$$folder"' EXIT
-	for world in $(wildcard reference/worlds/tuned reference/worlds/plain reference/worlds/tasks); do
+	for world in $(wildcard reference/worlds/tuned reference/worlds/plain reference/worlds/tasks reference/worlds/minigrid); do
 	    $(IN_VENV) tools.kept_runs unpack "$$world" "$$folder/$${world##*/}" --sample 1 >/dev/null
 	done
 	$(IN_VENV) mace_rl.cli verify "$$folder" --trust # a rule for β is of extras/
