@@ -64,7 +64,7 @@ def test_every_example_is_one_file_and_one_entry():
     assert {Path(name).suffix for name in FILES} == {".py", ".yaml"}
     assert all(f"{Path(name).stem}.yaml" in FILES for name in FILES)
     assert len(FILES["other_claims.yaml"].splitlines()) <= 24
-    folders = {"layer_norm", "grid_counts", "linear_decay", "rnd", "chain", "growing_chain"}
+    folders = {"layer_norm", "grid_counts", "linear_decay", "chain", "growing_chain"}
     assert set(TRAININGS) == folders
 
 
