@@ -156,6 +156,19 @@ def test_no_run_is_earlier_than_a_metric_can_be(metric):
     assert metric.earliest(50, 20) >= 1 and metric.function(curve(noisy(0)[:20])).number >= 1
 
 
+@pytest.mark.parametrize(
+    ("episodes", "count"), [(20, 7), (49, 7), (50, 4), (99, 4), (101, 1), (120, 1), (121, 0)]
+)
+def test_what_a_short_training_cannot_reach_is_known_before(episodes, count):
+    """Not even one that is good from the beginning, or once it has risen."""
+    good = np.full(episodes, 500.0)
+    found = [curve(own, random=-1e4, goals=(500.0,)) for own in (good, np.r_[-1e4, good[1:]])]
+    counted = [one for one in m.all_metrics(QUICK) if one.unit == "episodes"]
+    never = [one.name for one in counted if all(one.function(run).censored for run in found)]
+    assert m.out_of_reach(QUICK, episodes) == never
+    assert len(never) == count
+
+
 def late(given: m.LearningCurve) -> float:
     return float((given.returns >= given.solved).mean())
 

@@ -16,7 +16,7 @@ from mace_study.config.study import load_study
 from mace_rl.config.plugins import code_outside, source_files
 from mace_rl.environments import registered
 from mace_study.compare.claims_config import FEWEST_SEEDS, read_claims, too_few
-from mace_study.measure.metrics import all_metrics
+from mace_study.measure.metrics import all_metrics, out_of_reach
 from mace_rl.runs import provenance, slurm
 from mace_rl.base.code_digest import digest
 

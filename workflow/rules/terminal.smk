@@ -125,6 +125,9 @@ onstart:
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
     for line in study.metrics.incomplete(study.environments, study.variants):
         logger.info(line)
+    for episodes in sorted({episodes for *_, episodes in TRAININGS}):
+        if short := out_of_reach(MEASURED, episodes):
+            logger.info(f"{episodes} episodes are too few for {', '.join(short)}")
     for title, lacking in {} if LEDGER else LACKING.items():
         if not set(lacking).intersection(registered()):  # about environments that it has
             logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")

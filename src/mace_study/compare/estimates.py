@@ -91,7 +91,7 @@ def _pair(part: Part, runs: pd.DataFrame, metric: Metric | None, settings: Metri
     baseline = wide[part.baseline].to_numpy() if part.baseline else np.zeros_like(variant)
     if metric and metric.unit == "episodes":
         earliest = metric.earliest(settings.moving_average, budget)
-        resolution = settings.moving_average if earliest > 1 else 1
+        resolution = (metric.window or settings.moving_average) if earliest > 1 else 1
         return Pair(variant, baseline, float(budget), -earliest, resolution)
     if metric and metric.unit == "return":
         reference = settings.reference_return[environment]

@@ -88,8 +88,9 @@ class Metric:
     needs: str | None = None  # one of `GOALS`: a study that has none is without this metric
     # In comparisons.csv, where each metric makes the correction stricter.
     compared: bool = field(default=True, kw_only=True)
-    # Of the moving average's window and E, the first episode that it can be.
+    # Of the moving average's window and E, the first episode that it can be; above E if none.
     earliest: Callable[[int, int], int] = field(default=lambda window, _: 1, kw_only=True)
+    window: int | None = field(default=None, kw_only=True)  # its own; None: the study's
 
     @property
     def flag(self) -> str:
@@ -231,7 +232,9 @@ def solved(curve: LearningCurve) -> float:
 
 
 def _public_code_first(window: int, episodes: int) -> int:
-    return max(1, int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1)
+    first = max(1, int(PUBLIC_CODE_FLOOR * (episodes - PUBLIC_CODE_WINDOW + 1)) + 1)
+    slopes = episodes - 2 * PUBLIC_CODE_WINDOW + 1
+    return first if first <= slopes else episodes + 1
 
 
 def _episodes(
@@ -256,6 +259,7 @@ METRICS = (  # the area is under the learning curve, per episode
     replace(
         _episodes(convergence_steps_public_code, "Convergence (public code)", 0),
         earliest=_public_code_first,
+        window=PUBLIC_CODE_WINDOW,
     ),
     replace(
         _episodes(sample_efficiency_public_code, "Sample efficiency (public code)", 0),
@@ -290,6 +294,13 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
             continue
         raise ConfigError(f"metrics.custom has {reference!r}, which {problem}")
     return tuple(metrics)
+
+
+def out_of_reach(settings: MetricsConfig, episodes: int) -> list[str]:
+    """The metrics that no training of so many episodes attains, for it has too few to average."""
+    counted = (metric for metric in all_metrics(settings) if metric.unit == "episodes")
+    window = settings.moving_average
+    return [one.name for one in counted if one.earliest(window, episodes) > episodes]
 
 
 def metric_units(settings: MetricsConfig) -> dict[str, str]:
