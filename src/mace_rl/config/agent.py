@@ -1,6 +1,6 @@
 """Settings of `mace_rl.agent`: networks, critics and PPO."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
@@ -65,11 +65,3 @@ class PPOConfig(Section):
             right = "gae_lambda: 1.0, bootstrap_at_time_limit: false and scale_advantages: false"
             raise ValueError(f"normalise_returns goes with {right}")
         return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _critics_are_networks(cls, values: Any) -> Any:
-        # Records of earlier runs have this key, whose one value is left.
-        if isinstance(values, dict) and values.get("critic") == {"kind": "network"}:
-            return {key: value for key, value in values.items() if key != "critic"}
-        return values
