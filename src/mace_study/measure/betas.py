@@ -76,8 +76,9 @@ def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
     """
     first = 2 * math.ceil(window / 10)
     ends = range(first, min(2 * window, len(returns) + 1))
-    growing = [metrics.slope(returns[t % 2 : t], t // 2) for t in ends]  # one entry each
-    return np.concatenate([*growing, metrics.slope(returns, window)])
+    halves = ((returns[t % 2 : t - t // 2], returns[t - t // 2 : t]) for t in ends)
+    growing = [(later.sum() - earlier.sum()) / len(later) ** 2 for earlier, later in halves]
+    return np.concatenate([growing, metrics.slope(returns, window)])
 
 
 def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:
