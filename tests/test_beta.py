@@ -10,7 +10,7 @@ from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator
 from mace_rl.beta.gauge import Gauge
-from mace_rl.beta.lstm import lstm_logit
+from mace_rl.beta.lstm import lstm_output
 from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.environments.episode import Episode
 from mace_rl.training.factories import beta_controller
@@ -117,7 +117,7 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
         assert betas[-1] == pytest.approx(1 / (1 + math.exp(-np.clip(logit, -6, 6))), rel=1e-4)
         controller.next_episode(episode_of(n % 7), np.full(8, 1 / (1 + n)))
         if gauge.update(n % 7, 8 / (1 + n), 8) and settings.get("lstm", True):
-            known = lstm_logit(gauge.sequence(), network)
+            known = lstm_output(gauge.sequence(), network)
     assert len(credits) == 199 and max(betas) > 0.9 and min(betas) < 0.05
 
 

@@ -9,7 +9,7 @@ from shared import environment_of
 
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaGradient
-from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states
+from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_output, lstm_states
 from mace_rl.beta.meta import Evidence, MetaAdaptation
 from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
 from mace_rl.environments.episode import Episode
@@ -53,7 +53,7 @@ def test_gradient_by_autograd_in_float64(units, length):
         cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
         hidden = o.sigmoid() * cell.tanh()
     logit = readout @ hidden + readout_bias[0]
-    assert lstm_logit(sequence, network) == pytest.approx(logit.item(), rel=1e-5, abs=1e-5)
+    assert lstm_output(sequence, network) == pytest.approx(logit.item(), rel=1e-5, abs=1e-5)
     (-1.5 * logit).backward()
     expected = torch.cat([part.grad.ravel() for part in parts]).numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())

@@ -8,7 +8,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from mace_rl.beta.gauge import Gauge
-from mace_rl.beta.lstm import MetaNetwork, lstm_logit
+from mace_rl.beta.lstm import MetaNetwork, lstm_output
 from tools.meta.__main__ import LOGITS, Branch, Learner, as_one, earned, read_lives
 from tools.meta.tasks import Generated
 
@@ -19,7 +19,7 @@ def test_several_networks_as_one_answer_with_their_mean():
     seen = torch.randn(1, 30, Gauge.SIZE)
     with torch.no_grad():
         expected = np.mean([learner(seen)[0, -1].item() for learner in learners])
-    found = lstm_logit(seen[0].numpy(), MetaNetwork(**as_one(learners)))
+    found = lstm_output(seen[0].numpy(), MetaNetwork(**as_one(learners)))
     assert found == pytest.approx(expected, rel=1e-5)
 
 

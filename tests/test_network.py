@@ -11,7 +11,7 @@ import torch
 from shared import LAYER_NORM, laid_out
 
 from mace_rl.agent.custom import custom_module
-from mace_rl.beta.lstm import MetaNetwork, lstm_logit, read_network
+from mace_rl.beta.lstm import MetaNetwork, lstm_output, read_network
 from mace_rl.beta.pretrained import WEIGHTS
 from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
@@ -123,7 +123,7 @@ def test_meta_network_is_pytorch_s_lstm_with_a_readout(units, length):
     sequence = 2 * drawn(rng, (length, inputs))
     _, (hidden, _) = lstm(torch.from_numpy(sequence).double())
     expected = network.readout @ hidden[0].detach().numpy() + network.readout_bias
-    assert lstm_logit(sequence, network) == pytest.approx(*expected, rel=1e-5, abs=1e-5)
+    assert lstm_output(sequence, network) == pytest.approx(*expected, rel=1e-5, abs=1e-5)
 
 
 def test_a_permutation_is_uniform_if_the_draws_are():

@@ -3,19 +3,30 @@
 import itertools
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import CLAIMS, ENVIRONMENTS, PAPERS, ROBUST, STUDY, VARIANTS, table_for_claims
+from invented import (
+    CLAIMS,
+    ENVIRONMENTS,
+    PAPERS,
+    QUICK,
+    ROBUST,
+    STUDY,
+    VARIANTS,
+    table_for_claims,
+)
 from matplotlib.figure import Figure
 from shared import illegible, message
 
 from mace_study.compare import single_seeds as d
-from mace_study.compare.ledger import to_json
-from mace_study.compare.verdicts import ledger
+from mace_study.compare.ledger import Judgement, to_json
+from mace_study.compare.verdicts import ledger, verdict
+from mace_study.show import worlds as pictures
 from mace_study.show.curves import save_figure
 from tools import worlds
 
@@ -97,6 +108,26 @@ def test_how_often_a_draw_is_as_favourable(runs: pd.DataFrame) -> None:
         assert expected == pytest.approx(both)
 
 
+@pytest.mark.parametrize(
+    ("outcomes", "place"),
+    [
+        ("shown shown", 0),  # the smaller p
+        ("no_room shown", 0),
+        ("shown open", 1),
+        ("shown reversed", 1),
+        ("shown absent", 1),
+        ("absent reversed", 1),
+    ],
+)
+def test_the_number_of_a_cell_is_of_a_part_that_decides(outcomes, place) -> None:
+    (answer, *_) = ledger(table_for_claims(12, dict.fromkeys(VARIANTS, 0.0), 0.02), QUICK, PAPERS)
+    given = zip(answer.ways[ROBUST].parts, outcomes.split(), (0.01, 0.02), strict=True)
+    parts = [replace(part, outcome=one, p_holm=p, difference=p) for part, one, p in given]
+    judged = Judgement(verdict(outcomes.split()), "", parts)
+    table = pictures.verdicts({"tuned": [replace(answer, ways={ROBUST: judged})]})
+    assert list(table["difference"]) == [parts[place].difference]
+
+
 @pytest.mark.slow
 def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     """Three worlds: nothing differs, the learned β is better by far, and the first once more."""
@@ -130,8 +161,9 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
         for answer in answers:
             judged, row = answer.ways[ROBUST], found.loc[(answer.claim, world)]
             assert (row["verdict"], row["outcome"]) == (judged.verdict, judged.outcome)
-            assert row["p_holm"] == min(part.p_holm for part in judged.parts)
-            numbers = {(part.p_holm, part.difference, part.low) for part in judged.parts}
+            deciding = [part for part in judged.parts if part.outcome == judged.outcome]
+            assert row["p_holm"] == min(part.p_holm for part in deciding)
+            numbers = {(part.p_holm, part.difference, part.low) for part in deciding}
             assert tuple(row[["p_holm", "difference", "low"]]) in numbers
     assert found.loc[("C1", "plain"), "low"] > 0
     page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")

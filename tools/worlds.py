@@ -104,7 +104,7 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
         order = long[["claim", "statement"]].drop_duplicates()
         frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")
         decides = "These decide" if way == DECIDES else "These do not decide"
-        note = f"{decides}. Number: the part with the smallest p, its difference and 95 % interval."
+        note = f"{decides}. Number: {worlds.NUMBER}."
         sections.append(Section(f"Verdicts: {way}", note, frame))
     table = tables["numbers"]
     cells = table.assign(

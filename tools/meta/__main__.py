@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from mace_rl.beta.gauge import Gauge
-from mace_rl.beta.lstm import MetaNetwork, lstm_logit, read_network
+from mace_rl.beta.lstm import MetaNetwork, lstm_output, read_network
 from mace_rl.beta.squash import beta_of
 from tools.meta.lives import GRID, Branch, branches
 
@@ -106,7 +106,7 @@ def lived(task: tuple[int, Path | None]) -> list[Branch]:
 
     def choose(gauge: Gauge) -> float:
         assert network is not None
-        return beta_of(float(lstm_logit(gauge.sequence(), network)))
+        return beta_of(float(lstm_output(gauge.sequence(), network)))
 
     return branches(number, 1000 + number % 1000, choose if network else None)
 

@@ -35,7 +35,7 @@ class Judge(Stateful):
         self.horizon, self.bound = config.horizon, config.max_credit
         # Of each β that is being judged, the oldest first:
         self.directions: list[np.ndarray] = []  # what it changes in the policy, of length 1, or 0
-        self.bonus_weights: list[float] = []  # of the bonus in that update, at most 1
+        self.bonus_weights: list[float] = []  # RMS(A_I) in that update, at most 1
         self.credits: list[float] = []
         self.alignments, self.alignment_weight = 0.0, 0.0  # running sum of squares, of weights
 

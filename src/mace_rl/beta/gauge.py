@@ -1,4 +1,4 @@
-"""What the meta network reads of a training: returns and bonus, window after window."""
+"""What the pretrained LSTM reads of a training: returns and bonus, window after window."""
 
 import math
 

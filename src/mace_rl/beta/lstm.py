@@ -76,21 +76,21 @@ def lstm_states(sequence, network):
 @kernel
 def read_out(hidden, network):
     """The readout of the last hidden state: a chain of fused multiply-adds."""
-    logit, last = network.readout_bias[0], hidden[-1]
+    output, last = network.readout_bias[0], hidden[-1]
     for j in range(len(last)):
-        logit = fma(last[j], network.readout[j], logit)
-    return logit
+        output = fma(last[j], network.readout[j], output)
+    return output
 
 
 @kernel
-def lstm_logit(sequence: np.ndarray, network: MetaNetwork) -> np.float32:
+def lstm_output(sequence: np.ndarray, network: MetaNetwork) -> np.float32:
     """The readout of the last hidden state after a sequence, float32 [T, in], from a zero state."""
     return read_out(lstm_states(sequence, network)[2], network)
 
 
 @kernel
-def add_gradient(sequence, states, network, grad_logit, gradient):
-    """Add ∇ of `grad_logit` times the readout to `gradient`, a `MetaNetwork` of arrays alike.
+def add_gradient(sequence, states, network, grad_output, gradient):
+    """Add ∇ of `grad_output` times the readout to `gradient`, a `MetaNetwork` of arrays alike.
 
     states: of `lstm_states` for this sequence. Backpropagation through time.
     """
@@ -101,9 +101,9 @@ def add_gradient(sequence, states, network, grad_logit, gradient):
     grad_hidden, grad_cell = np.empty((1, size), np.float32), np.zeros(size, np.float32)
     nothing = np.zeros(size, np.float32)
     for j in range(size):
-        grad_hidden[0, j] = grad_logit * network.readout[j]
-        gradient.readout[j] += grad_logit * hidden[steps, j]
-    gradient.readout_bias[0] += grad_logit
+        grad_hidden[0, j] = grad_output * network.readout[j]
+        gradient.readout[j] += grad_output * hidden[steps, j]
+    gradient.readout_bias[0] += grad_output
     for t in range(steps - 1, -1, -1):
         gate, change, grad = gates[t], changes[t], grad_hidden[0]
         for j in range(size):

@@ -3,8 +3,8 @@
 The paper (supplement): its input is "a sequence of the agent's experiences from the preceding
 episode, including states, actions, and rewards", its output "determines the β for the next
 episode", and it "is trained with its own optimizer". It names no loss. Ours, -c o + λ o² / 2, is in
-`beta.network`: o is the output, c the credit of its β (`beta.credit`), what a little more of it did
-to the extrinsic return.
+`beta.network`: o is the output, c the credit of its β (`beta.credit`), what a little more of that
+β did to the extrinsic return.
 """
 
 import math
@@ -46,7 +46,7 @@ class MetaAdaptation(Stateful, BetaController):
         generator: np.random.Generator,
     ) -> None:
         """initial: β as long as nothing has been learned."""
-        self.config, self.initial = config, logit(initial)
+        self.config, self.initial_logit = config, logit(initial)
         self.actions = spaces.action_size if isinstance(spaces.action_space, Discrete) else 0
         inputs = spaces.observation_size + spaces.action_size + 2
         kind = CompiledMetaNetwork if engine == "compiled" else TorchMetaNetwork
@@ -63,7 +63,7 @@ class MetaAdaptation(Stateful, BetaController):
     @property
     def beta(self) -> float:
         """See `BetaController`."""
-        return beta_of(self.initial + self.correction)
+        return beta_of(self.initial_logit + self.correction)
 
     @property
     def correction(self) -> float:

@@ -9,7 +9,7 @@ from torch import Tensor, from_numpy
 from torch.nn.utils import clip_grad_norm_
 
 from mace_rl.base.state import Stateful
-from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_logit, lstm_states, read_out
+from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_output, lstm_states, read_out
 from mace_rl.config.beta import MetaConfig
 from mace_rl.numerics.adam import EPSILON, Adam, step
 from mace_rl.numerics.compiling import kernel
@@ -17,13 +17,13 @@ from mace_rl.numerics.elementary import f32
 
 
 class LearningNetwork(Protocol):
-    """An LSTM with a readout o, and an Adam of its own (paper, supplement)."""
+    """An LSTM with a readout o, and an Adam of its own (paper, supplement). λ: `output_decay`."""
 
     def output(self, sequence: np.ndarray) -> float:
         """o after a sequence, float32 [T, in]."""
 
     def learn(self, sequences: list[np.ndarray], credit: float) -> None:
-        """One step down the mean over the sequences of L = -c o + λ o² / 2, c being the credit."""
+        """One step down the mean over the sequences of L = -c o + λ o² / 2; c: the credit."""
 
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
@@ -51,12 +51,12 @@ class CompiledMetaNetwork(Stateful):
         self.gradients = MetaNetwork.of(self.gradient, *shape)
 
     def output(self, sequence: np.ndarray) -> float:
-        return float(lstm_logit(sequence, self.weights))
+        return float(lstm_output(sequence, self.weights))
 
     def learn(self, sequences: list[np.ndarray], credit: float) -> None:
         steps, ends = np.concatenate(sequences), np.cumsum([len(each) for each in sequences])
         where = self.weights, self.gradient, self.gradients, self.optimiser.state
-        learn(steps, ends, f32(credit), f32(self.decay), *where)
+        descend(steps, ends, f32(credit), f32(self.decay), *where)
 
 
 class TorchMetaNetwork(Stateful):
@@ -109,7 +109,7 @@ class TorchMetaNetwork(Stateful):
 
 
 @kernel
-def learn(steps, ends, credit, decay, weights, gradient, gradients, adam):
+def descend(steps, ends, credit, decay, weights, gradient, gradients, adam):
     """`LearningNetwork.learn` from the sequences one after the other, float32 [N, in].
 
     ends: of each; gradient: a vector like all weights, overwritten; gradients: its parts.

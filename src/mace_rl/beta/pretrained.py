@@ -8,7 +8,7 @@ from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator, Judge
 from mace_rl.beta.gauge import Gauge
-from mace_rl.beta.lstm import lstm_logit, read_network
+from mace_rl.beta.lstm import lstm_output, read_network
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.squash import beta_of, logit
 from mace_rl.config.beta import PretrainedConfig
@@ -35,7 +35,7 @@ class PretrainedLSTM(Stateful):
         """Take in one more episode; at the end of a window `logit` is what it says of β."""
         closed = self.gauge.update(total(episode.rewards), total(bonus), len(episode))
         if closed and self.network is not None:
-            self.logit = float(lstm_logit(self.gauge.sequence(), self.network))
+            self.logit = float(lstm_output(self.gauge.sequence(), self.network))
 
 
 class PretrainedAdaptation(Stateful, BetaController):

@@ -29,8 +29,8 @@ def diagnose(
         explained_variance(rollout.advantages_of(kind), rollout.returns(kind))
         for kind in ("extrinsic", "intrinsic")
     )
-    advantages, _, share, _ = rollout.advantages
-    extrinsic, weighted = dot(advantages, advantages), dot(share, share)
+    parts = rollout.advantages
+    extrinsic, weighted = (dot(one, one) for one in (parts.extrinsic, parts.weighted))
     number, episode, env_steps = count
     return UpdateRecord(
         update=number,

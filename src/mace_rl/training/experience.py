@@ -24,7 +24,7 @@ class Experience:
     beta: float
     bonus: Bonus | None  # None in plain PPO
     extrinsic: Evaluation
-    intrinsic: Evaluation  # `without_bonus`, zeros
+    intrinsic: Evaluation  # zeros in plain PPO, `without_bonus`
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
@@ -32,7 +32,7 @@ class Experience:
         return {"extrinsic": self.extrinsic, "intrinsic": self.intrinsic}
 
     def with_normalised_returns(self) -> "Experience":
-        """With returns less their mean, over the deviation of the total reward's, R_E + β R_I."""
+        """With centred returns, over the deviation of the total reward's, R_E + β R_I."""
         returns = self.extrinsic.returns + self.beta * self.intrinsic.returns
         unit = math.sqrt(variance(returns) * len(returns) / max(len(returns) - 1, 1)) + 1e-7
 

@@ -4,12 +4,12 @@
 
 One `Trainer` is one run. Each round plays whole episodes with the current policy, finds the
 advantages of each episode's reward and of its curiosity bonus, and lets it become memory
-(`collect`, `advantages`). Then what sets β learns (`meta_update`), and PPO updates the policy with
-both advantages, weighed by β (`ppo_update`). What they use is in the folders `agent` (PPO), `bonus`
-(novelty, episodic memory), `beta` (schedules, meta network) and `environments`; `factories` makes
-it as the settings ask for. Where β meets the advantage: `experience.weigh`. PPO's clipped loss:
-`agent.torch_learner`; its gradient in compiled code: `agent.compiled_learner`. The meta network's
-loss: `beta.network`.
+(`collect`, `advantages`). Then the β controller learns (`meta_update`), and PPO updates the policy
+with both advantages, weighed by β (`ppo_update`). What they use is in the folders `agent` (PPO),
+`bonus` (novelty, episodic memory), `beta` (schedules, meta network) and `environments`; `factories`
+makes it as the settings ask for. Where β meets the advantage: `experience.weigh`. PPO's clipped
+loss: `agent.torch_learner`; its gradient in compiled code: `agent.compiled_learner`. The meta
+network's loss: `beta.network`.
 """
 
 from collections.abc import Iterator
@@ -99,14 +99,13 @@ class Trainer:
         """Bonus, β and the advantages of both rewards; then the episode becomes memory."""
         observations = self.ppo.normalise(episode.observations)
         unit = self.ppo.unit("extrinsic")
-        rewards = episode.rewards, episode.terminated
-        extrinsic = self.ppo.advantages("extrinsic", observations, *rewards)
+        ends = episode.terminated
+        extrinsic = self.ppo.advantages("extrinsic", observations, episode.rewards, ends)
         warn_of_rewards(self.config, unit, self.ppo.unit("extrinsic"), len(self.records) + 1)
         beta, bonus, intrinsic = 0.0, None, without_bonus(len(episode))
         if self.curiosity is not None and self.controller is not None:
             beta, bonus = self.controller.beta, self.curiosity.bonus(episode)
-            rewards = bonus.reward, episode.terminated
-            intrinsic = self.ppo.advantages("intrinsic", observations, *rewards)
+            intrinsic = self.ppo.advantages("intrinsic", observations, bonus.reward, ends)
             returns = discounted_returns(episode.rewards, self.config.ppo.discount)
             self.curiosity.remember(episode, returns)
             self.controller.next_episode(episode, bonus.reward)
@@ -129,7 +128,7 @@ class Trainer:
         )
 
     def meta_update(self, rollout: Rollout) -> float | None:
-        """Tell what sets β what β changes in the policy's update, before it.
+        """Show the β controller how β changes the policy's coming update.
 
         The update steps along the policy gradient g of the normalised total advantage, as Adam
         preconditions it. Shown are dg/dβ, preconditioned alike, and g_E, that of the extrinsic
@@ -141,13 +140,13 @@ class Trainer:
         if not self.controller.learns:
             return None
         centred, learner = self.config.ppo.centre_advantages, self.ppo.learner
-        extrinsic, intrinsic, _, weighed = rollout.advantages
+        extrinsic, intrinsic, _, whole = rollout.advantages
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
-        change = normalised_change(weighed, intrinsic, centred)
+        change = normalised_change(whole, intrinsic, centred)
         steps = rollout.observations, rollout.actions
-        gradient, change = learner.policy_gradients(*steps, [extrinsic, change])
-        of_beta = BetaGradient(learner.preconditioned(change), root_mean_square(intrinsic))
+        gradient, of_change = learner.policy_gradients(*steps, [extrinsic, change])
+        of_beta = BetaGradient(learner.preconditioned(of_change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), of_beta)
 
     def ppo_update(self, rollout: Rollout) -> Update:

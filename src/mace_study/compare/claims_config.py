@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # imports Gymnasium, which tables do without
 class Part(NamedTuple):
     """In these environments, on this metric: `variant` is better than `baseline`."""
 
-    environments: tuple[str, ...]  # of several the mean of the differences, as shares of everything
+    environments: tuple[str, ...]  # of several the mean of the differences, as shares of each scale
     metric: str
     variant: str
     baseline: str | None  # None: over 0

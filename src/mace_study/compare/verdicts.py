@@ -77,7 +77,7 @@ def judge(parts: Sequence[Part], table: pd.DataFrame, settings: MetricsConfig) -
 
 
 def verdict(outcomes: Sequence[str]) -> str:
-    """Of a claim, from what its parts came out as; in the words of parts."""
+    """A claim's outcome, from its parts'; in their words."""
     found = set(outcomes)
     if found == {"shown"}:
         return "shown"

@@ -67,7 +67,7 @@ class LearningCurve:
         return slope(self.returns, self.settings.moving_average)
 
     def bar(self, goal: float) -> float:
-        """The return threshold of the way from random actions to `goal`."""
+        """The return `threshold` of the way from random actions to `goal`."""
         return self.random_mean + self.settings.threshold * (goal - self.random_mean)
 
     def first(self, reached: np.ndarray, episode: int = 1) -> Attained:
@@ -125,9 +125,9 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
 
 
 def sample_efficiency(curve: LearningCurve) -> Attained:
-    """The first episode with a return ≥ threshold · final (paper, literally).
+    """The first episode with a return ≥ threshold · final (paper), of a run that has `learned`.
 
-    Negative returns: the bar is above the final return. Censored: never reached, or not `learned`.
+    Negative returns: the bar is above the final return. Censored: never reached, or not learned.
     """
     reached = curve.returns >= curve.settings.threshold * curve.final
     return curve.first(reached & curve.learned)

@@ -24,6 +24,7 @@ from mace_study.show.pictures import INK, OUTCOMES, wrapped
 from mace_study.show.tables import number
 
 LINE = 0.15  # inches
+NUMBER = "of the parts that decide that with the smallest p, its difference and 95 % interval"
 SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
 # From seaborn's palette that the colour-blind can tell apart; none is a verdict's.
 COLOURS = ("#949494", "#56b4e9", "#ca9161")
@@ -33,10 +34,10 @@ def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
     """A row per way of measuring, claim and world.
 
     Columns: measured (in which way), claim, statement, world, outcome, verdict; difference, low,
-    high and p_holm of its best-supported part, that with the smallest p.
+    high and p_holm of the part with the smallest p, of those that decide.
     """
     rows = [
-        (how, answer.claim, answer.statement, world, *_best_supported(judged))
+        (how, answer.claim, answer.statement, world, *_decisive(judged))
         for world, answers in worlds.items()
         for answer in answers
         for how, judged in answer.ways.items()
@@ -45,8 +46,13 @@ def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, "difference", "low", "high", "p_holm"])
 
 
-def _best_supported(judged: Judgement) -> tuple[Any, ...]:
-    part = min(judged.parts, key=lambda part: (part.p_holm, -abs(part.difference)))
+def _decisive(judged: Judgement) -> tuple[Any, ...]:
+    # A part reversed beside one shown makes a claim absent, though no part is.
+    of_parts = judged.outcome, "reversed"
+    deciding = next(
+        own for what in of_parts if (own := [one for one in judged.parts if one.outcome == what])
+    )
+    part = min(deciding, key=lambda part: (part.p_holm, -abs(part.difference)))
     verdict = judged.outcome, judged.verdict
     return *verdict, part.difference, part.low, part.high, part.p_holm
 
@@ -59,7 +65,7 @@ def difference(value: float, low: float, high: float) -> str:
 
 
 def draw_verdicts(table: pd.DataFrame) -> Figure:
-    """A cell per claim and world in the verdict's colour, with its best-supported difference."""
+    """A cell per claim and world in the verdict's colour, with the difference that decides."""
     claims = table.drop_duplicates("claim")
     named = zip(claims["claim"], claims["statement"], strict=True)
     said = {claim: wrapped(f"{claim} {statement}", 46) for claim, statement in named}
@@ -88,8 +94,7 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
         axes.set_xticks(np.arange(len(worlds)) + 0.485, worlds)
         axes.tick_params(top=False, labeltop=True, bottom=False, labelbottom=False)
         axes.spines[:].set_visible(False)
-        told = "Number: the part with the smallest p, its difference and 95 % interval."
-        legend(figure, f"{told} Colour: what decides.")
+        legend(figure, f"Number: {NUMBER}. Colour: what decides.")
     return figure
 
 
