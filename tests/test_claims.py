@@ -189,6 +189,11 @@ def test_the_ledger_is_read_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "claims.json"
     path.write_text(to_json({"runs": 9}, answers), encoding="utf-8")
     assert repr(read_ledger(path)) == repr(answers)
+    whole = path.read_text(encoding="utf-8")
+    for damaged in ("", "[]", whole[:-100], whole.replace('"parts"', '"part"')):
+        path.write_text(damaged, encoding="utf-8")
+        with pytest.raises(RecordError, match=r"claims\.json: not as the workflow writes it"):
+            read_ledger(path)
 
 
 @pytest.mark.parametrize(

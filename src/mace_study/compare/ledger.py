@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from mace_rl.training.records import RecordError
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -79,12 +81,14 @@ def to_json(cost: Mapping[str, Any], answers: Iterable[Answer]) -> str:
 
 
 def read_ledger(path: str | Path) -> list[Answer]:
-    """What `to_json` wrote."""
-    return [answer_of(record) for record in json.loads(Path(path).read_bytes())["claims"]]
+    """What `to_json` wrote; `RecordError` if it never did."""
+    try:
+        return [_answer(record) for record in json.loads(Path(path).read_bytes())["claims"]]
+    except (ValueError, LookupError, TypeError, AttributeError):
+        raise RecordError(f"{path}: not as the workflow writes it") from None
 
 
-def answer_of(record: dict[str, Any]) -> Answer:
-    """One record of claims.json, which this uses up."""
+def _answer(record: dict[str, Any]) -> Answer:
     own = {field.name: record.pop(field.name) for field in fields(Answer) if field.name in record}
     return Answer(**own, ways={how: _judgement(**judged) for how, judged in record.items()})
 
