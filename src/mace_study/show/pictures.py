@@ -212,6 +212,8 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
             own = table[table["measured"] == how]
             for outcome, (colour, label) in OUTCOMES.items():
                 parts = own[own["outcome"] == outcome]
+                if parts.empty:
+                    continue
                 bars = parts["place"], parts["low"], parts["high"]
                 axes.hlines(*bars, color=colour, linewidth=1.2)
                 dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
