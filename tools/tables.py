@@ -82,8 +82,8 @@ def reduce_colours(picture: Path) -> None:
     Those that are nearest on average would leave out a dot of a colour that is nowhere else.
     """
     with Image.open(picture) as image:
-        how = {"method": Image.Quantize.MAXCOVERAGE, "dither": Image.Dither.NONE}
-        reduced = image.convert("RGB").quantize(256, **how)
+        how = Image.Quantize.MAXCOVERAGE
+        reduced = image.convert("RGB").quantize(256, how, dither=Image.Dither.NONE)
     reduced.save(picture, optimize=True)
 
 

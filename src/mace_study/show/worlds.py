@@ -24,7 +24,7 @@ from mace_study.show.pictures import INK, OUTCOMES, wrapped
 from mace_study.show.tables import number
 
 LINE = 0.15  # inches
-NUMBER = "of the parts that decide that with the smallest p, its difference and 95 % interval"
+NUMBER = "the part with the smallest p of those that decide, its difference and 95 % interval"
 SEVERAL = 3  # times the least number as the greatest: from there on a logarithmic axis
 # From seaborn's palette that the colour-blind can tell apart; none is a verdict's.
 COLOURS = ("#949494", "#56b4e9", "#ca9161")
