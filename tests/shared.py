@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from matplotlib.axis import XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -38,6 +38,8 @@ VARIANTS = ["ppo", "mace_fixed", "mace_full"]
 NETWORKS = ["actor", "extrinsic", "intrinsic"]
 SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 LAYER_NORM = {"kind": "torch", "module": "shared:layer_norm"}  # as `ppo.network`
+ARMS = {"arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
+BANDIT = {"kind": "custom", "rule": "extras.bandit:Bandit", "arguments": ARMS}  # as `beta`
 
 # What is in the folder of a run, at its end and before.
 OUTCOME = ["agent.pt", "diagnostics.csv", "episodes.csv"]
@@ -46,6 +48,11 @@ UNFINISHED = ["checkpoint.pt", "progress.json"]
 
 # Options of `mace-rl train` that are good.
 GOOD = {"--env": "CartPole-v1", "--variant": "ppo", "--seed": "0", "--episodes": "3"}
+
+
+def vector_of(name: str, count: int, mode: AutoresetMode) -> SyncVectorEnv:
+    makers = [lambda: gymnasium.make(name) for _ in range(count)]
+    return SyncVectorEnv(makers, autoreset_mode=mode)
 
 
 class Twin:

@@ -263,6 +263,19 @@ def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
     assert answers["C9"][ROBUST].parts[0].room == 1
 
 
+@pytest.mark.parametrize(
+    ("how", "metric", "window"),
+    [(LITERAL, "convergence_steps_public_code", 50), (ROBUST, "convergence_steps", 400)],
+)
+def test_a_rule_with_its_own_window_has_the_margin_of_that(how, metric, window) -> None:
+    frame = table_for_claims(12, SMALL, noise=0.1)
+    wide = QUICK.model_copy(update={"moving_average": 400})
+    answers = {one.claim: one.ways for one in verdicts.ledger(frame, wide, PAPERS)}
+    mean = frame.query("env == 'Acrobot-v1' and variant == 'ppo'")[metric].mean()
+    part = answers["C2"][how].parts[0]
+    assert (part.metric, part.worth_mentioning) == (metric, max(mean / 10, window))
+
+
 # The file of what a paper says.
 
 SEVENTH = " " * 12 + "- {<<: *full, environments: [Acrobot-v1, HopperBulletEnv-v0], "

@@ -109,6 +109,7 @@ def edit(finished: Project) -> Iterator:
 def test_everything_is_made_and_the_terminal_says_how_far_it_is(finished: Project) -> None:
     terminal, file = finished["terminal.log"].read_text(), finished["file.log"].read_text()
     assert "6 of 6 runs to train; how far they are: mace-rl status results" in terminal
+    assert "4 episodes are too few for convergence_steps, " in terminal  # moving averages of 50
     assert "train CartPole-v1 ppo 0" in terminal and "0 of 6 runs to train" in file
     assert "Error" not in terminal + file
     for output in (terminal, file):
