@@ -121,34 +121,6 @@ def test_beta_is_what_the_lstm_says_and_what_the_credits_add_up_to(make, setting
     assert len(credits) == 199 and max(betas) > 0.9 and min(betas) < 0.05
 
 
-def test_the_hybrid_adds_what_its_two_parts_say_alone(run_config):
-    """In logits, of which β = 0.4 counts once."""
-
-    def build(kind: str, **changes) -> BetaController:
-        beta, meta = {"kind": kind, "initial": 0.4}, {"horizon": 1, "gain": 0.3}
-        variant = "mace_pretrained" if kind == "pretrained" else "mace_full"
-        changes |= {} if variant == "mace_pretrained" else {"meta": meta}
-        config = run_config("CartPole-v1", variant, 0, episodes=200, beta=beta, **changes)
-        return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
-
-    hybrid, network = build("hybrid"), build("meta")
-    lstm = build("pretrained", pretrained={"credit_gain": 0.0})
-    rng, paths = np.random.default_rng(0), []
-    for n in range(200):
-        gradient = np.array([1.0, 0.5 * rng.standard_normal()], np.float32)
-        effect = BetaGradient(np.array([1.0, 0.0], np.float32), 1.0)
-        credits = [one.learn(gradient, 1.0, effect) for one in (hybrid, network)]
-        assert credits[0] == credits[1]
-        played = Episode(rng.random((9, 4)), rng.integers(2, size=8), np.zeros(8), np.ones(8), True)
-        for one in (hybrid, network, lstm):
-            one.next_episode(played, np.full(8, 1 / (1 + n)))
-        paths.append([one.beta for one in (hybrid, network, lstm)])
-    hybrid_logit, *parts = np.log(np.array(paths).T / (1 - np.array(paths).T))
-    expected = np.clip(sum(parts) - math.log(0.4 / 0.6), -6, 6)
-    np.testing.assert_allclose(hybrid_logit, expected, atol=1e-6)
-    assert all(np.ptp(part) > 0.1 and np.abs(part).max() < 5.9 for part in parts)
-
-
 def test_it_explores_while_nothing_is_found_and_ends_it_when_learning_advances(make):
     """What the LSTM has learned, where the bonus fades; without credit."""
     found = np.where(np.arange(1000) < 300, 0.0, np.minimum(1, np.arange(1000) / 300 - 1))
@@ -199,7 +171,7 @@ def test_the_integrator_as_a_detector(run_config, signal, low, high):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["mace_full", "mace_pretrained"])
+@pytest.mark.parametrize("variant", ["mace_evidence", "mace_pretrained"])
 @pytest.mark.parametrize(
     ("problem", "low", "high"), [("Help", 0.6, 1), ("Harm", 0, 0.1), ("Nothing", 0.1, 0.6)]
 )
@@ -212,7 +184,7 @@ def test_planted_problems(problem, low, high, variant):
 @pytest.mark.slow
 def test_the_network_reads_which_kind_of_episode_comes_next():
     """In one kind the bonus helps, in the other it harms; they alternate. A sum sees neither."""
-    trainer = planted("PlantedMixed-v0", "mace_full")
+    trainer = planted("PlantedMixed-v0", "mace_evidence")
     late = np.array([record.beta for record in trainer.records[-80:]])
     kinds = [late[1::2].mean(), late[0::2].mean()]  # the last episode's first
     helps, harms = kinds if trainer.environment.env.unwrapped.flag == "right" else kinds[::-1]

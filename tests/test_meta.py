@@ -1,4 +1,4 @@
-"""The paper's meta network: gradients, loss, evidence and reading, each computed another way."""
+"""The paper's meta network: gradients, what it reads, the credit and evidence, computed another way."""
 
 import math
 
@@ -9,8 +9,9 @@ from shared import environment_of
 
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaGradient
+from mace_rl.beta.credit import Evidence
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_output, lstm_states
-from mace_rl.beta.meta import Evidence, MetaAdaptation
+from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
 from mace_rl.environments.episode import Episode
 from mace_rl.training.factories import beta_controller
@@ -23,12 +24,18 @@ def invented(rng, steps: int, seen: int = 4, actions: int = 2) -> tuple[Episode,
     return Episode(observations, chosen, np.zeros(steps), rewards, True), rng.random(steps)
 
 
+EVIDENCE = {"horizon": 10, "max_credit": 3.0, "chance": 0.3, "scale": 50.0, "gain": 6.0}
+
+
 @pytest.fixture
 def make(run_config):
-    """`make(engine, **settings of meta)`: the controller of mace_full in CartPole."""
+    """`make(engine, objective, **settings of meta)`: the controller of mace_evidence in CartPole."""
 
-    def build(engine: str = "compiled", **settings) -> MetaAdaptation:
-        config = run_config("CartPole-v1", "mace_full", 0, engine=engine, meta=settings)
+    def build(engine: str = "compiled", objective=None, **settings) -> MetaAdaptation:
+        beta = {"kind": "meta", "initial": 0.4, "objective": {"kind": "evidence", **EVIDENCE}}
+        beta["objective"] |= objective or {}
+        changes = {"engine": engine, "meta": settings, "beta": beta}
+        config = run_config("CartPole-v1", "mace_evidence", 0, **changes)
         return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
 
     return build
@@ -61,7 +68,7 @@ def test_gradient_by_autograd_in_float64(units, length):
 
 def test_both_engines_learn_the_same(make):
     """`torch.nn.LSTM`, autograd and `torch.optim.Adam`; from one to five sequences a credit."""
-    config, rng = make().config, np.random.default_rng(1)
+    config, rng = make().reader.config, np.random.default_rng(1)
     ours = CompiledMetaNetwork(config, 7, np.random.default_rng(0))
     theirs = TorchMetaNetwork(config, 7, np.random.default_rng(0))
     outputs = []
@@ -72,9 +79,9 @@ def test_both_engines_learn_the_same(make):
         ]
         outputs.append(ours.output(sequences[0]))
         assert outputs[-1] == pytest.approx(theirs.output(sequences[0]), rel=1e-3, abs=1e-5)
-        credit = 1 + rng.standard_normal()
+        slope = -1 - rng.standard_normal()
         for network in (ours, theirs):
-            network.learn(sequences, credit)
+            network.learn(sequences, slope)
     assert outputs[0] == 0 and max(outputs) > 0.1
 
 
@@ -90,7 +97,7 @@ def test_what_is_read_by_numpy(make):
         std = np.std(rows, axis=0)
         expected = ((own - np.mean(rows, axis=0)) / np.where(std > 1e-8, std, 1)).clip(-5, 5)
         expected[:, :4] /= 2
-        found = controller.read(episode, bonus)
+        found = controller.reader.read(episode, bonus)
         assert found.dtype == np.float32 and len(found) == min(steps, 8)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -106,7 +113,7 @@ def test_box_actions_are_read_as_they_are(run_config):
     actions = rng.standard_normal((steps, 1)).astype(np.float32)
     seen = rng.standard_normal((steps + 1, 3)).astype(np.float32)
     episode = Episode(seen, actions, np.zeros(steps), np.zeros(steps), False)
-    found = controller.read(episode, np.zeros(steps))
+    found = controller.reader.read(episode, np.zeros(steps))
     expected = (actions - actions.mean()) / actions.std()
     np.testing.assert_allclose(found[:, 3:4], expected, rtol=1e-4, atol=1e-5)
     assert (found[:, 4:] == 0).all()  # what has not varied
@@ -114,8 +121,8 @@ def test_box_actions_are_read_as_they_are(run_config):
 
 def test_evidence_by_another_sum(make):
     """And Robbins' bound: a credit that agrees crosses it, chance seldom does."""
-    config, rng = make().config, np.random.default_rng(0)
-    evidence, terms, outputs = Evidence(config), [], []
+    config, rng = make().objective.config, np.random.default_rng(0)
+    evidence, terms, outputs = Evidence(config, 8), [], []
     for _ in range(400):
         output, credit = rng.standard_normal(), rng.standard_normal()
         credit += 0.5 * np.sign(output)
@@ -124,23 +131,23 @@ def test_evidence_by_another_sum(make):
             size = np.sqrt(np.sum(ages * np.square(outputs)) / ages.sum())
             terms.append(credit * np.clip(output / size, -1, 1))
             assert evidence.unit(output) == pytest.approx(np.clip(output / size, -1, 1))
-        evidence.add(credit, output)
+        evidence.credited(credit, output)
         outputs.append(output)
-    known = np.square(terms).sum() + config.evidence_scale
-    bound = math.sqrt(2 * math.log(1 / 0.3) + math.log(known / config.evidence_scale))
+    known = np.square(terms).sum() + config.scale
+    bound = math.sqrt(2 * math.log(1 / 0.3) + math.log(known / config.scale))
     beyond = sum(terms) / math.sqrt(known) - bound
     assert beyond > 0.5 and evidence.beyond_chance == pytest.approx(beyond)
     assert evidence.logit(9.0) == pytest.approx(6 * beyond)
     assert evidence.logit(-9.0) == pytest.approx(-6 * beyond)
     crossed = 0
     for _ in range(200):
-        evidence = Evidence(config)
+        evidence = Evidence(config, 8)
         for output, credit in rng.standard_normal((1500, 2)):
-            evidence.add(credit, output)
+            evidence.credited(credit, output)
             if evidence.beyond_chance > 0:
                 crossed += 1
                 break
-    assert crossed <= 0.15 * 200  # half of `evidence_chance`: the sum would have to be positive
+    assert crossed <= 0.15 * 200  # half of `chance`: the sum would have to be positive
 
 
 def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
@@ -149,11 +156,10 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
     Two episodes a rollout, judged by one update: the network that is shown what the controller
     should learn from, by hand, has the same weights.
     """
-    settings = {"horizon": 1, "evidence_scale": 1.0, "sequences": 3}
-    controller, rng = make(**settings), np.random.default_rng(3)
-    config, inputs = controller.config, len(controller.normaliser.mean)
-    network = CompiledMetaNetwork(config, inputs, Streams(0)["meta"])
-    evidence, read, waiting, source = Evidence(config), [], None, None
+    controller = make(objective={"horizon": 1, "scale": 1.0}, sequences=3)
+    config, rng = controller.reader.config, np.random.default_rng(3)
+    network = CompiledMetaNetwork(config, controller.reader.inputs, Streams(0)["meta"])
+    evidence, read, waiting, source = Evidence(controller.objective.config, 3), [], None, None
     assert controller.beta == pytest.approx(0.4)
     for update in range(120):
         sources = []
@@ -165,7 +171,7 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
                 expected = 1 / (1 + 1.5 * math.exp(-np.clip(added, -5.5, 6.4)))
             assert controller.beta == pytest.approx(expected, rel=1e-4)
             controller.next_episode(*invented(rng, int(rng.integers(1, 60))))
-            source = controller.source
+            source = controller.sequence
             read.append(source)
         if len(sources) > 3:
             sources = [sources[k * len(sources) // 3] for k in range(3)]
@@ -174,25 +180,32 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
         assert (credit is None) == (update == 0)
         output = np.mean([network.output(sequence) for sequence in sources])
         if waiting and credit is not None:
-            evidence.add(credit, waiting[1])
-            network.learn(waiting[0], credit)
+            evidence.credited(credit, waiting[1])
+            network.learn(waiting[0], -credit)
         waiting = sources, output
     assert (network.optimiser.parameters == controller.network.optimiser.parameters).all()
     assert controller.beta > 0.9  # more of it was always good
 
 
-@pytest.mark.parametrize("settings", [{"reads": False}, {"trusts_evidence": False}])
-def test_without_a_part(make, settings):
-    """What reads nothing is told the same for all; what does not wait moves with its output."""
-    controller, rng = make(horizon=1, **settings), np.random.default_rng(0)
-    betas = []
+def test_what_reads_nothing_is_told_the_same_for_all(make):
+    controller, rng = make(objective={"horizon": 1}, reads=False), np.random.default_rng(0)
     for _ in range(15):
         controller.next_episode(*invented(rng, 20))
         effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
         controller.learn(np.array([1, 0], np.float32), 1.0, effect)
-        betas.append(controller.beta)
-    if "reads" in settings:
-        assert (controller.source == 0).all() and betas == pytest.approx([0.4] * 15)
-    else:
-        output = controller.network.output(controller.source)
-        assert betas[-1] == pytest.approx(1 / (1 + 1.5 * math.exp(-output))) and betas[-1] > 0.405
+        assert controller.beta == pytest.approx(0.4) and (controller.sequence == 0).all()
+
+
+def test_without_evidence_beta_moves_with_the_output(run_config):
+    objective = {"kind": "credit", "horizon": 1, "max_credit": 3.0}
+    beta = {"kind": "meta", "initial": 0.4, "objective": objective}
+    config = run_config("CartPole-v1", "mace_credit_network", 0, beta=beta)
+    controller = beta_controller(config, environment_of("CartPole-v1"), Streams(0))
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        controller.next_episode(*invented(rng, 20))
+        effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
+        controller.learn(np.array([1, 0], np.float32), 1.0, effect)
+    output = controller.network.output(controller.sequence)
+    assert controller.beta == pytest.approx(1 / (1 + 1.5 * math.exp(-output)))
+    assert controller.beta > 0.405

@@ -134,7 +134,7 @@ def _resolve(given: RunSettings, environment: str, variant: str, changes: Settin
         source_files(reference, f"in the settings of {environment} and {variant}, {key}")
     unused = unused_sections(config)
     for section, reason in unused.items():
-        if section in given.variant_settings[variant].settings:
+        if given.variant_settings[variant].settings.get(section) is not None:
             raise ConfigError(
                 f"variant_settings.{variant} has the section {section!r}, which a variant with "
                 f"{reason} does not use"

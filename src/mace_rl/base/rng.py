@@ -11,6 +11,7 @@ STREAMS = (
     # "density" and what follows it: of the bonus and β; "dropout" in `published` alone.
     *("density", "density_batches", "meta", "novelty", "beta", "bonus", "dropout"),
     "global",  # seeds Python's, NumPy's and PyTorch's own, from which other people's code may draw
+    "exploration",  # of the β that a meta network learns from
 )
 
 

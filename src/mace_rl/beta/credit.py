@@ -10,14 +10,23 @@ depends on β is therefore, up to a positive factor (Xu et al. 2018),
 """
 
 import math
+from collections import deque
 
 import numpy as np
 
 from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaGradient
-from mace_rl.config.beta import CreditConfig, PretrainedConfig
+from mace_rl.beta.objectives import Lesson, Objective, Played, evenly
+from mace_rl.beta.squash import natural_log
+from mace_rl.config.beta import (
+    CreditConfig,
+    CreditObjective,
+    EvidenceObjective,
+    PretrainedConfig,
+)
 from mace_rl.numerics.matmul import dot
 
+SIZE_DECAY = 0.99  # of the running mean that says how large outputs usually are, per credit
 SCALE_DECAY = 0.99  # of the running mean that says how large alignments usually are, per update
 
 
@@ -104,3 +113,92 @@ class Integrator(Stateful):
             return 0.0
         z = self.sum / math.sqrt(max(self.squares, self.expected / 2))
         return math.copysign(self.gain * max(abs(z) - self.threshold, 0.0), z)
+
+
+class Credit(Objective):
+    """L = −c o: the credit c of β, a meta-gradient of the extrinsic return (Xu et al. 2018).
+
+    c is what a little more of β in a rollout did to it. The network learns from all episodes of the
+    rollout, at most `sequences`.
+    """
+
+    STATE = ("judge", "played", "judged")
+
+    asks_policy = True
+
+    def __init__(self, config: CreditObjective, sequences: int) -> None:
+        self.judge, self.most = Judge(config), sequences
+        self.played: list[tuple[np.ndarray, float]] = []  # since the last update: read, output
+        # Of each rollout whose β is being judged, the oldest first: what was read, mean output.
+        self.judged: deque[tuple[list[np.ndarray], float]] = deque()
+
+    def after_episode(self, played: Played) -> None:
+        """See `Objective`."""
+        self.played.append((played.sequence, played.output))
+
+    def after_rollout(
+        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
+    ) -> tuple[float | None, Lesson | None]:
+        """See `Objective`."""
+        credit = self.judge.judge(gradient, advantage_rms, change)
+        chosen = evenly(self.played, self.most)
+        mean_output = sum(output for _, output in chosen) / max(len(chosen), 1)
+        self.judged.append(([sequence for sequence, _ in chosen], mean_output))
+        self.played = []
+        if credit is None:
+            return None, None
+        sequences, output = self.judged.popleft()
+        if not sequences:  # the first episode's β was given
+            return credit, None
+        self.credited(credit, output)
+        return credit, Lesson(sequences, -credit)
+
+    def credited(self, credit: float, output: float) -> None:
+        """A credit has come for the output that set its β."""
+
+
+class Evidence(Credit):
+    """The same, but β waits for evidence that outputs had the right sign before their credits came.
+
+    S = Σ c u, with u the output in units of its usual size, at most 1. Each u is known before its
+    c, so S has mean 0 if β changes nothing, whatever the network has learned from noise. Its
+    variance is V = Σ (c u)². Only what is beyond Robbins' bound (1970) moves β: chance crosses that
+    in a given share of all trainings, however long they are.
+    """
+
+    STATE = (*Credit.STATE, "sum", "variance", "size", "weight")
+
+    def __init__(self, config: EvidenceObjective, sequences: int) -> None:
+        super().__init__(config, sequences)
+        self.config = config
+        self.sum, self.variance = 0.0, 0.0
+        self.size, self.weight = 0.0, 0.0  # running sum of o², and of the weights in it
+
+    def unit(self, output: float) -> float:
+        """u; NaN stays NaN."""
+        if not self.size:
+            return 0.0 * output
+        return min(max(output / math.sqrt(self.size / self.weight), -1.0), 1.0)
+
+    def credited(self, credit: float, output: float) -> None:
+        """See `Credit`."""
+        term = credit * self.unit(output)
+        self.sum += term
+        self.variance += term**2
+        self.size = SIZE_DECAY * self.size + output**2
+        self.weight = SIZE_DECAY * self.weight + 1
+
+    @property
+    def beyond_chance(self) -> float:
+        """How far S is beyond the bound, in standard deviations; 0 if it is not.
+
+        The bound is √((V + ρ) (2 ln 1/α + ln (V + ρ)/ρ)): S crosses it, above or below, with
+        probability α at most.
+        """
+        known, chance = self.variance + self.config.scale, self.config.chance
+        bound = 2 * natural_log(1 / chance) + natural_log(known / self.config.scale)
+        return max(self.sum / math.sqrt(known) - math.sqrt(bound), 0.0)
+
+    def logit(self, output: float) -> float:
+        """See `Objective`."""
+        return self.config.gain * self.beyond_chance * self.unit(output)

@@ -22,8 +22,8 @@ class LearningNetwork(Protocol):
     def output(self, sequence: np.ndarray) -> float:
         """o after a sequence, float32 [T, in]."""
 
-    def learn(self, sequences: list[np.ndarray], credit: float) -> None:
-        """One step down the mean over the sequences of L = -c o + λ o² / 2; c: the credit."""
+    def learn(self, sequences: list[np.ndarray], slope: float) -> None:
+        """One step down the mean over the sequences of L + λ o² / 2; slope: dL/do."""
 
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
@@ -53,10 +53,10 @@ class CompiledMetaNetwork(Stateful):
     def output(self, sequence: np.ndarray) -> float:
         return float(lstm_output(sequence, self.weights))
 
-    def learn(self, sequences: list[np.ndarray], credit: float) -> None:
+    def learn(self, sequences: list[np.ndarray], slope: float) -> None:
         steps, ends = np.concatenate(sequences), np.cumsum([len(each) for each in sequences])
         where = self.weights, self.gradient, self.gradients, self.optimiser.state
-        descend(steps, ends, f32(credit), f32(self.decay), *where)
+        descend(steps, ends, f32(slope), f32(self.decay), *where)
 
 
 class TorchMetaNetwork(Stateful):
@@ -99,9 +99,9 @@ class TorchMetaNetwork(Stateful):
         with torch.no_grad():
             return self.outputs(sequence).item()
 
-    def learn(self, sequences: list[np.ndarray], credit: float) -> None:
+    def learn(self, sequences: list[np.ndarray], slope: float) -> None:
         outputs = torch.cat([self.outputs(sequence) for sequence in sequences])
-        loss = (-credit * outputs + self.decay / 2 * outputs.square()).mean()
+        loss = (slope * outputs + self.decay / 2 * outputs.square()).mean()
         self.optimiser.zero_grad()
         loss.backward()
         clip_grad_norm_(self.learnt, self.largest)
@@ -109,7 +109,7 @@ class TorchMetaNetwork(Stateful):
 
 
 @kernel
-def descend(steps, ends, credit, decay, weights, gradient, gradients, adam):
+def descend(steps, ends, slope, decay, weights, gradient, gradients, adam):
     """`LearningNetwork.learn` from the sequences one after the other, float32 [N, in].
 
     ends: of each; gradient: a vector like all weights, overwritten; gradients: its parts.
@@ -119,7 +119,7 @@ def descend(steps, ends, credit, decay, weights, gradient, gradients, adam):
     for end in ends:
         sequence = steps[first:end]
         states = lstm_states(sequence, weights)
-        slope = (decay * read_out(states[2], weights) - credit) / f32(len(ends))
-        add_gradient(sequence, states, weights, slope, gradients)
+        own = (decay * read_out(states[2], weights) + slope) / f32(len(ends))
+        add_gradient(sequence, states, weights, own, gradients)
         first = end
     step(gradient, adam)

@@ -9,7 +9,6 @@ from mace_rl.beta.controller import BetaController, BetaGradient
 from mace_rl.beta.credit import Integrator, Judge
 from mace_rl.beta.gauge import Gauge
 from mace_rl.beta.lstm import lstm_output, read_network
-from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.squash import beta_of, logit
 from mace_rl.config.beta import PretrainedConfig
 from mace_rl.environments.episode import Episode
@@ -69,30 +68,3 @@ class PretrainedAdaptation(Stateful, BetaController):
         if credit is not None:
             self.integrator.add(credit, self.lstm.gauge.progress)
         return credit
-
-
-class HybridAdaptation(Stateful, BetaController):
-    """The logit of β is the pretrained LSTM's answer plus what the paper's network adds to it."""
-
-    STATE = ("lstm", "meta")
-    learns = True
-
-    def __init__(self, meta: MetaAdaptation, initial: float, episodes: int) -> None:
-        """meta: the paper's network; initial, episodes: of `PretrainedLSTM`."""
-        self.lstm, self.meta = PretrainedLSTM(initial, episodes), meta
-
-    @property
-    def beta(self) -> float:
-        """See `BetaController`."""
-        return beta_of(self.lstm.logit + self.meta.correction)
-
-    def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
-        """See `BetaController`."""
-        self.lstm.read(episode, bonus)
-        self.meta.next_episode(episode, bonus)
-
-    def learn(
-        self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
-    ) -> float | None:
-        """See `BetaController`."""
-        return self.meta.learn(gradient, advantage_rms, change)

@@ -16,20 +16,72 @@ class CreditConfig(Section):
     max_credit: PositiveFloat  # bound of a β's credit, in units of its usual size
 
 
-class MetaConfig(CreditConfig):
+class MetaConfig(Section):
     """The meta-adaptation network, which learns during the run (paper, supplement)."""
 
     hidden_units: Count = Field(multiple_of=4)
     learning_rate: PositiveFloat
     max_gradient_norm: PositiveFloat
-    output_decay: NonNegativeFloat  # λ in its loss, -c o + λ o² / 2
+    output_decay: NonNegativeFloat  # λ of λ o² / 2 in its loss
     chunks: Count  # rows at most that it reads of an episode
-    sequences: Count  # episodes at most, of a rollout, that it learns from
-    evidence_chance: float = Field(gt=0, lt=1)  # of trainings in which β may move for nothing
-    evidence_scale: PositiveFloat  # variance of the evidence at which it is best seen
-    gain: NonNegativeFloat  # of β's logit per standard deviation of evidence beyond chance
+    sequences: Count  # episodes at most that it learns from in one step
     reads: bool = True  # false: it sees a constant, whatever was played; to see what reading does
-    trusts_evidence: bool = True  # false: its output moves β as it is; to see what waiting does
+
+
+class ReturnObjective(Section):
+    """`mace_rl.beta.objectives.Return`: the public code's loss, connected."""
+
+    kind: Literal["return"]
+    centred: bool  # less the mean of the last returns
+    recent: Count  # of these: they also say what size is usual
+
+
+class PerturbedObjective(Section):
+    """`mace_rl.beta.objectives.Perturbed`."""
+
+    window: Count  # episodes for which a perturbation stays
+    noise: PositiveFloat  # its size, in β's logit
+    lag: float = Field(ge=1)  # episodes after which it acts
+    recent: Count  # payments that say what is usual
+
+
+class ScoreObjective(PerturbedObjective):
+    """`mace_rl.beta.objectives.Score`: paid by returns."""
+
+    kind: Literal["score"]
+
+
+class ProgressObjective(PerturbedObjective):
+    """`mace_rl.beta.objectives.Progress`: paid by learning progress."""
+
+    kind: Literal["progress"]
+    stretch: Count  # episodes whose returns are compared with those of as many before
+
+
+class WordsObjective(Section):
+    """`mace_rl.beta.objectives.Words`: what the paper says that β does, as its target."""
+
+    kind: Literal["words"]
+    stretch: Count  # as in `ProgressObjective`
+
+
+class CreditObjective(CreditConfig):
+    """`mace_rl.beta.credit.Credit`: a meta-gradient."""
+
+    kind: Literal["credit"]
+
+
+class EvidenceObjective(CreditConfig):
+    """`mace_rl.beta.credit.Evidence`: the same, and β waits until it is beyond chance."""
+
+    kind: Literal["evidence"]
+    chance: float = Field(gt=0, lt=1)  # of trainings in which β may move for nothing
+    scale: PositiveFloat  # variance of the evidence at which it is best seen
+    gain: NonNegativeFloat  # of β's logit per standard deviation of evidence beyond chance
+
+
+ByReturns = ReturnObjective | ScoreObjective | ProgressObjective | WordsObjective
+MetaObjective = ByReturns | CreditObjective | EvidenceObjective
 
 
 class PretrainedConfig(CreditConfig):
@@ -75,19 +127,13 @@ class MetaBeta(Section):
 
     kind: Literal["meta"]
     initial: float = Field(gt=0, lt=1)
+    objective: MetaObjective | None = Field(default=None, discriminator="kind")  # what it learns
 
 
 class PretrainedBeta(Section):
     """β by the pretrained LSTM; `initial` is β of the first hundredth of the training."""
 
     kind: Literal["pretrained"]
-    initial: float = Field(gt=0, lt=1)
-
-
-class HybridBeta(Section):
-    """β by the pretrained LSTM, which the paper's network corrects in place of the credit's sum."""
-
-    kind: Literal["hybrid"]
     initial: float = Field(gt=0, lt=1)
 
 
@@ -103,4 +149,4 @@ class CustomBeta(Section):
 
 
 BetaRule = ConstantBeta | ExponentialBeta | CustomBeta
-BetaConfig = NoBonus | MetaBeta | PretrainedBeta | HybridBeta | BetaRule
+BetaConfig = NoBonus | MetaBeta | PretrainedBeta | BetaRule

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, PositiveInt, model_validator
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.beta import BetaConfig, MetaConfig, PretrainedConfig
+from mace_rl.config.beta import BetaConfig, MetaBeta, MetaConfig, PretrainedConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.published import COMPUTED, PublishedConfig
 from mace_rl.config.section import Arguments, Reference, Section, short_repr
@@ -21,7 +21,7 @@ from mace_rl.config.section import Arguments, Reference, Section, short_repr
 IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 # Used only where beta.kind is one of these.
-BETA_SECTIONS = {"meta": ("meta", "hybrid"), "pretrained": ("pretrained",)}
+BETA_SECTIONS = {"meta": ("meta",), "pretrained": ("pretrained",)}
 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -119,6 +119,8 @@ class RunConfig(AgentConfig):
 
     @model_validator(mode="after")
     def _all_that_is_used(self) -> "RunConfig":
+        if isinstance(self.beta, MetaBeta) and not self.beta.objective and not self.trainer:
+            raise ValueError("beta.objective is missing: what the meta network learns from")
         for section in {*BONUS_SECTIONS, *BETA_SECTIONS} - set(unused_sections(self)):
             if getattr(self, section) is None:
                 raise ValueError(f"the section {section!r} is missing")

@@ -14,8 +14,10 @@ from mace_rl.agent.ppo import PPO, ActorCritic
 from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController
+from mace_rl.beta.credit import Credit, Evidence
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.pretrained import HybridAdaptation, PretrainedAdaptation
+from mace_rl.beta.objectives import Objective, Progress, Return, Score, Words
+from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
@@ -23,12 +25,18 @@ from mace_rl.config.agent import TorchModule
 from mace_rl.config.beta import (
     BetaRule,
     ConstantBeta,
+    CreditObjective,
     CustomBeta,
+    EvidenceObjective,
     ExponentialBeta,
-    HybridBeta,
     MetaBeta,
+    MetaObjective,
     NoBonus,
     PretrainedBeta,
+    ProgressObjective,
+    ReturnObjective,
+    ScoreObjective,
+    WordsObjective,
 )
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
 from mace_rl.config.plugins import make
@@ -54,12 +62,11 @@ def unchecked_controller(
 ) -> BetaController:
     """The same as it is."""
     match config.beta:
-        case MetaBeta(initial=initial) | HybridBeta(initial=initial):
-            assert config.meta is not None  # `RunConfig` checked that
+        case MetaBeta(initial=initial, objective=objective):
+            assert config.meta is not None and objective is not None  # `RunConfig` checked that
+            learned = meta_objective(objective, config.meta.sequences, streams["exploration"])
             own = environment, config.engine, streams["meta"]
-            meta = MetaAdaptation(config.meta, initial, *own)
-            hybrid = isinstance(config.beta, HybridBeta)
-            return HybridAdaptation(meta, initial, config.episodes) if hybrid else meta
+            return MetaAdaptation(config.meta, learned, initial, *own)
         case PretrainedBeta(initial=initial):
             assert config.pretrained is not None
             return PretrainedAdaptation(config.pretrained, initial, config.episodes)
@@ -67,6 +74,25 @@ def unchecked_controller(
             return beta_rule(rule, streams["beta"])
         case NoBonus():
             raise ValueError("without a bonus there is no β")
+
+
+def meta_objective(
+    settings: MetaObjective, sequences: int, generator: np.random.Generator
+) -> Objective:
+    """What the meta network learns from."""
+    match settings:
+        case ReturnObjective():
+            return Return(settings)
+        case ScoreObjective():
+            return Score(settings, generator)
+        case ProgressObjective():
+            return Progress(settings, generator)
+        case WordsObjective():
+            return Words(settings)
+        case EvidenceObjective():
+            return Evidence(settings, sequences)
+        case CreditObjective():
+            return Credit(settings, sequences)
 
 
 def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
