@@ -65,8 +65,7 @@ class Bandit(Stateful, BetaController):
         self.worst, self.best = math.inf, -math.inf
         self.returns: list[float] = []  # of this rollout's episodes
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """See `BetaController`."""
         return self.settings.arms[self.arm]
 

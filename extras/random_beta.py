@@ -37,8 +37,7 @@ class RandomBeta(Stateful, BetaController):
         self.settings, self.generator = check(Settings, arguments, "arguments"), generator
         self._beta = self.draw()
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """See `BetaController`."""
         return self._beta
 

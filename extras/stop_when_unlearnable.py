@@ -33,8 +33,7 @@ class StopWhenUnlearnable(Stateful, BetaController):
         self.first: list[float] = []  # of the episodes of the first window, their mean bonus
         self.last: list[float] = []  # of those since, a window of them at most
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """See `BetaController`."""
         return self._beta
 

@@ -39,7 +39,23 @@ NETWORKS = ["actor", "extrinsic", "intrinsic"]
 SOON = {"write_every": 1, "refresh_every": 20}  # all of novelty is at work in few episodes
 LAYER_NORM = {"kind": "torch", "module": "shared:layer_norm"}  # as `ppo.network`
 ARMS = {"arms": [0.1, 0.5], "window": 5, "exploration": 1.0, "epsilon": 0.3}
+WEIGHED = {"lstm": True, "credit_gain": 4.0, "credit_threshold": 2.0}
+WEIGHED |= {"initial": 0.4, "horizon": 10, "max_credit": 3.0}
+RULE = "extras.pretrained.rule:Pretrained"
+EVIDENCE = {"horizon": 10, "max_credit": 3.0, "chance": 0.3, "scale": 50.0, "gain": 6.0}
 BANDIT = {"kind": "custom", "rule": "extras.bandit:Bandit", "arguments": ARMS}  # as `beta`
+
+
+def pretrained(**arguments: Any) -> dict[str, Any]:
+    """β by the pretrained LSTM, as `beta`."""
+    return {"kind": "custom", "rule": RULE, "arguments": WEIGHED | arguments}
+
+
+def learned(kind: str = "evidence", **settings: Any) -> dict[str, Any]:
+    """β by the meta network, which learns from evidence or the credit, as `beta`."""
+    own = EVIDENCE if kind == "evidence" else {"horizon": 10, "max_credit": 3.0}
+    return {"kind": "meta", "initial": 0.4, "objective": {"kind": kind, **own, **settings}}
+
 
 # What is in the folder of a run, at its end and before.
 OUTCOME = ["agent.pt", "diagnostics.csv", "episodes.csv"]

@@ -209,10 +209,11 @@ RULE = {"kind": "custom", "rule": "test_extras:Noted"}
 
 
 class Noted(Constant):
-    beta = None
-
     def __init__(self, generator, beta=0.5, learns=False):
         self.beta, self.learns, self.shown = beta, learns, []
+
+    def next_beta(self):
+        return self.beta
 
     def next_episode(self, *shown):
         self.shown.append(shown)

@@ -1,11 +1,11 @@
-"""The paper's meta network: gradients, what it reads, the credit and evidence, computed another way."""
+"""The paper's meta network: gradients, what it reads, credit and evidence, in another way."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from shared import environment_of
+from shared import environment_of, learned
 
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaGradient
@@ -24,17 +24,12 @@ def invented(rng, steps: int, seen: int = 4, actions: int = 2) -> tuple[Episode,
     return Episode(observations, chosen, np.zeros(steps), rewards, True), rng.random(steps)
 
 
-EVIDENCE = {"horizon": 10, "max_credit": 3.0, "chance": 0.3, "scale": 50.0, "gain": 6.0}
-
-
 @pytest.fixture
 def make(run_config):
-    """`make(engine, objective, **settings of meta)`: the controller of mace_evidence in CartPole."""
+    """`make(engine, objective, **settings of meta)`: that of mace_evidence in CartPole."""
 
     def build(engine: str = "compiled", objective=None, **settings) -> MetaAdaptation:
-        beta = {"kind": "meta", "initial": 0.4, "objective": {"kind": "evidence", **EVIDENCE}}
-        beta["objective"] |= objective or {}
-        changes = {"engine": engine, "meta": settings, "beta": beta}
+        changes = {"engine": engine, "meta": settings, "beta": learned(**(objective or {}))}
         config = run_config("CartPole-v1", "mace_evidence", 0, **changes)
         return beta_controller(config, environment_of("CartPole-v1"), Streams(0))
 
@@ -160,7 +155,7 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
     config, rng = controller.reader.config, np.random.default_rng(3)
     network = CompiledMetaNetwork(config, controller.reader.inputs, Streams(0)["meta"])
     evidence, read, waiting, source = Evidence(controller.objective.config, 3), [], None, None
-    assert controller.beta == pytest.approx(0.4)
+    assert controller.next_beta() == pytest.approx(0.4)
     for update in range(120):
         sources = []
         for _ in range(5 if update % 3 else 2):
@@ -169,7 +164,7 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
                 sources.append(source)
                 added = evidence.logit(network.output(source))
                 expected = 1 / (1 + 1.5 * math.exp(-np.clip(added, -5.5, 6.4)))
-            assert controller.beta == pytest.approx(expected, rel=1e-4)
+            assert controller.next_beta() == pytest.approx(expected, rel=1e-4)
             controller.next_episode(*invented(rng, int(rng.integers(1, 60))))
             source = controller.sequence
             read.append(source)
@@ -184,28 +179,29 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
             network.learn(waiting[0], -credit)
         waiting = sources, output
     assert (network.optimiser.parameters == controller.network.optimiser.parameters).all()
-    assert controller.beta > 0.9  # more of it was always good
+    assert controller.next_beta() > 0.9  # more of it was always good
 
 
 def test_what_reads_nothing_is_told_the_same_for_all(make):
     controller, rng = make(objective={"horizon": 1}, reads=False), np.random.default_rng(0)
     for _ in range(15):
+        controller.next_beta()
         controller.next_episode(*invented(rng, 20))
         effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
         controller.learn(np.array([1, 0], np.float32), 1.0, effect)
-        assert controller.beta == pytest.approx(0.4) and (controller.sequence == 0).all()
+        assert controller.next_beta() == pytest.approx(0.4) and (controller.sequence == 0).all()
 
 
 def test_without_evidence_beta_moves_with_the_output(run_config):
-    objective = {"kind": "credit", "horizon": 1, "max_credit": 3.0}
-    beta = {"kind": "meta", "initial": 0.4, "objective": objective}
+    beta = learned("credit", horizon=1)
     config = run_config("CartPole-v1", "mace_credit_network", 0, beta=beta)
     controller = beta_controller(config, environment_of("CartPole-v1"), Streams(0))
     rng = np.random.default_rng(0)
     for _ in range(15):
+        controller.next_beta()
         controller.next_episode(*invented(rng, 20))
         effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
         controller.learn(np.array([1, 0], np.float32), 1.0, effect)
     output = controller.network.output(controller.sequence)
-    assert controller.beta == pytest.approx(1 / (1 + 1.5 * math.exp(-output)))
-    assert controller.beta > 0.405
+    assert controller.next_beta() == pytest.approx(1 / (1 + 1.5 * math.exp(-output)))
+    assert controller.next_beta() > 0.405

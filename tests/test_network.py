@@ -10,9 +10,9 @@ import pytest
 import torch
 from shared import LAYER_NORM, laid_out
 
+from extras.pretrained.rule import WEIGHTS
 from mace_rl.agent.custom import custom_module
 from mace_rl.beta.lstm import MetaNetwork, lstm_output, read_network
-from mace_rl.beta.pretrained import WEIGHTS
 from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled

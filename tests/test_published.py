@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from shared import learned
 from torch.nn import functional
 
 from mace_rl import published
@@ -176,10 +177,9 @@ def test_what_it_would_ignore_is_refused(changes, words):
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("kind", ["pretrained", "hybrid"])
-def test_a_learned_beta_of_ours_is_refused_where_it_is_asked_for(kind):
-    with pytest.raises(ConfigError, match=f"beta.kind is '{kind}'"):
-        PublishedTrainer(make(beta={"kind": kind, "initial": 0.4}))
+def test_what_its_network_does_not_learn_is_refused_where_it_is_asked_for():
+    with pytest.raises(ConfigError, match="objective is 'evidence'"):
+        PublishedTrainer(make(beta=learned()))
 
 
 @pytest.mark.parametrize("engine", ["compiled", "torch"])

@@ -6,11 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import LAYER_NORM, NETWORKS, ROOT, SOON, VARIANTS, Bonanza, Twin, finish
+from shared import LAYER_NORM, NETWORKS, ROOT, SOON, VARIANTS, Bonanza, Twin, finish, pretrained
+from shared import learned as by_evidence
 
+from extras.pretrained.rule import Pretrained
 from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.config.reading import merge
 from mace_rl.runs.agent import Agent
 from mace_rl.runs.checkpoint import archive
@@ -156,13 +157,17 @@ def test_normaliser_of_the_update_is_that_of_acting(run_config):
 
 @pytest.mark.parametrize(
     ("environment", "variant"),
-    [("Pendulum-v1", "mace_full"), *(("CartPole-v1", variant) for variant in VARIANTS)],
+    [
+        ("Pendulum-v1", "mace_evidence"),
+        *(("CartPole-v1", variant) for variant in (*VARIANTS, "mace_evidence")),
+    ],
 )
 def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment, variant):
     """The learner's own numbers, which test_ppo.py checks, and the others another way."""
-    settings = {"rollout_steps": 400 if environment == "Pendulum-v1" else 60}
-    meta = {"horizon": 1}
-    trainer = Trainer(run_config(environment, variant, 1, episodes=9, ppo=settings, meta=meta))
+    changes = {"ppo": {"rollout_steps": 400 if environment == "Pendulum-v1" else 60}}
+    if variant == "mace_evidence":
+        changes["beta"] = by_evidence(horizon=1)
+    trainer = Trainer(run_config(environment, variant, 1, episodes=9, **changes))
     rollouts, told, critics = rollouts_of(trainer, monkeypatch), [], []
     update = trainer.ppo.update
 
@@ -201,7 +206,7 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
             for part in ("novelty", "relevance", "similarity"):
                 steps = [value for item in rollout for value in getattr(item.bonus, part)]
                 expected[part] = sum(steps) / len(steps)
-        if variant == "mace_full" and number > 0:  # test_credit.py has its value
+        if variant == "mace_evidence" and number > 0:  # test_credit.py has its value
             expected["beta_credit"] = row.beta_credit
         found = {key: value for key, value in vars(row).items() if not math.isnan(value)}
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-6)
@@ -231,20 +236,21 @@ def learned(trainer: Trainer) -> list[bytes]:
     ],
 )
 def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, settings):
-    judged = {"horizon": 1}
-    changes = {"episodes": 12, "meta": judged, "pretrained": judged, "novelty": SOON} | SETTINGS[
-        settings
-    ]
+    changes = {"episodes": 12, "novelty": SOON} | SETTINGS[settings]
     plain = finish(run_config(environment, "ppo", 3, **changes))
     zero = {"kind": "exponential", "initial": 0.0, "decay": 0.9, "floor": 0.0}
     fixed = finish(run_config(environment, "mace_fixed", 3, beta=zero, **changes))
-    for controller in (MetaAdaptation, PretrainedAdaptation):
-        monkeypatch.setattr(controller, "beta", property(lambda self: 0.0))
+    for controller in (MetaAdaptation, Pretrained):
+        asked = controller.next_beta
+        monkeypatch.setattr(controller, "next_beta", lambda self, asked=asked: 0.0 * asked(self))
     full = finish(run_config(environment, "mace_full", 3, **changes))
-    ours = finish(run_config(environment, "mace_pretrained", 3, **changes))
+    beta = by_evidence(horizon=1)
+    evidence = finish(run_config(environment, "mace_evidence", 3, beta=beta, **changes))
+    beta = pretrained(horizon=1)
+    ours = finish(run_config(environment, "mace_fixed", 3, beta=beta, **changes))
     some = finish(run_config(environment, "mace_fixed", 3, **changes))
     assert learned(some)[0] != learned(plain)[0]  # else a bonus that is lost would pass, too
-    for trainer in (fixed, full, ours):
+    for trainer in (fixed, full, evidence, ours):
         assert without_bonus(trainer.records) == without_bonus(plain.records)
         assert learned(trainer) == learned(plain)
         assert trainer.noise.bit_generator.state == plain.noise.bit_generator.state
@@ -252,7 +258,8 @@ def test_beta_0_equals_ppo_to_the_bit(run_config, monkeypatch, environment, sett
         assert sum(record.intrinsic_return for record in trainer.records) > 10
         assert len(trainer.curiosity.memory) > 0
         assert len(trainer.curiosity.novelty.visited) > 100  # so that all of novelty is estimated
-    assert full.controller.evidence.weight > 0
+    assert full.controller.objective.episodes == 11
+    assert evidence.controller.objective.weight > 0
     assert ours.controller.integrator.squares > 0 and len(ours.controller.lstm.gauge.windows) == 12
 
 
@@ -293,8 +300,8 @@ def test_global_generators_are_left_alone(run_config, settings):
         ("FrozenLake-v1", "mace_fixed", "several"),
         ("HopperBulletEnv-v0", "mace_full", "an episode"),
         ("FrozenLake-v1", "mace_full", "torch"),
-        ("CartPole-v1", "mace_pretrained", "several"),
-        ("CartPole-v1", "hybrid", "several"),
+        ("CartPole-v1", "mace_evidence", "several"),
+        ("CartPole-v1", "pretrained", "several"),
         ("Pendulum-v1", "mace_full", "a network of one's own"),
     ],
 )
@@ -303,18 +310,20 @@ def test_state_holds_all_that_the_rest_depends_on(run_config, environment, varia
     changes = {"episodes": 16, "ppo": {"rollout_steps": 25}}
     changes["novelty"] = SOON | {"refresh_every": 60}  # so that some states wait
     # And each credit moves β.
-    changes["meta"] = {"horizon": 2, "evidence_chance": 0.999, "evidence_scale": 0.1}
-    changes["pretrained"] = {"horizon": 2, "credit_threshold": 0.0}
-    if variant == "hybrid":
-        variant, changes["beta"] = "mace_full", {"kind": "hybrid", "initial": 0.4}
+    if variant == "mace_evidence":
+        changes["beta"] = by_evidence(horizon=2, chance=0.999, scale=0.1)
+    if variant == "pretrained":
+        variant = "mace_fixed"
+        changes["beta"] = pretrained(horizon=2, credit_threshold=0.0)
     config = run_config(environment, variant, 2, **merge(SETTINGS[settings], changes))
     whole = Trainer(config)
     rounds = whole.run()
     for _ in range(3):
         next(rounds)
     state = archive(whole.state_dict())
-    if variant in ("mace_full", "mace_pretrained"):
-        assert len(getattr(whole.controller, "meta", whole.controller).judge.directions) == 2
+    if "beta" in changes:
+        judge = getattr(whole.controller, "objective", whole.controller).judge
+        assert len(judge.directions) == 2
     for _ in rounds:
         pass
     rest = Trainer(config)

@@ -58,7 +58,7 @@ class ByEpisodes:
     def pay(self, episode: Episode) -> tuple[float, float, float, np.ndarray]:
         """β, unit, mean, and the bonus with its factors, [T, 3]; then it is remembered."""
         bonus = self.curiosity.bonus(episode)
-        beta, unit, usual = self.beta.beta, 0.0, np.mean(self.bonuses or [0.0])
+        beta, unit, usual = self.beta.next_beta(), 0.0, np.mean(self.bonuses or [0.0])
         self.bonuses += bonus.reward.tolist()
         if self.sums[0]:
             extrinsic, intrinsic = (np.std(sums) for sums in self.sums)

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from mace_rl.base.errors import Refusal
 from mace_rl.training.records import RecordError
-from mace_study.compare.claims_config import read_claims
+from mace_study.compare.claims_config import LEARNED, read_claims
 from mace_study.compare.ledger import read_ledger
 from mace_study.compare.single_seeds import draw, numbers
 from mace_study.config.study import read_study
@@ -28,10 +28,11 @@ from mace_study.show.markdown import page
 from mace_study.show.sections import Section
 from mace_study.show.tables import side_by_side
 
-WORLDS, FOLDER = ("tuned", "plain", "published"), "worlds"
+# With the variant that is the learned β in each.
+WORLDS = {"tuned": "mace_evidence", "plain": "mace_evidence", "published": LEARNED}
+FOLDER = "worlds"
 ROOT = Path(__file__).resolve().parent.parent
-CONFIG = ROOT / "config.yaml"  # every world has its labels, colours and measures ...
-VARIANTS = ROOT / "config" / "worlds" / "tuned.yaml"  # ... and variants that this has
+CONFIG = ROOT / "config.yaml"  # every world has its labels, colours and measures
 DECIDES = "robust"  # the way to measure that is counted and pictured
 COMMAND = "`python -m tools.worlds`"
 # The metrics that the protocol names; the first is not the public code's rule, as its words ask.
@@ -41,14 +42,14 @@ RULE = "[rule](../../../docs/metrics.md#the-rule)"
 
 def make(folder: Path) -> list[str]:
     """Make FOLDER/worlds; returns what it then has, nothing if there is no world."""
-    study = read_study([CONFIG, VARIANTS])
+    study = read_study([CONFIG])
     table1 = read_claims(study, CONFIG.parent / study.claims).table1
     look = plot_style(study.metrics, study.figure.model_dump(), study.labels, study.colours)
     there = [world for world in WORLDS if (folder / world / "metrics.csv").exists()]
     if not there:
         return []
-    runs = {world: _runs(folder / world / "metrics.csv", table1.variants) for world in there}
-    curves = {world: pd.read_csv(folder / world / "figure1.csv") for world in there}
+    runs = {world: _runs(folder, world, table1.variants) for world in there}
+    curves = {world: _read(folder, world, "figure1.csv") for world in there}
     ledgers = {world: folder / world / "claims.json" for world in there}
     answers = {world: read_ledger(path) for world, path in ledgers.items() if path.exists()}
     tables: dict[str, pd.DataFrame] = {}
@@ -163,9 +164,14 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     return sections
 
 
-def _runs(path: Path, variants: Iterable[str]) -> pd.DataFrame:
+def _read(folder: Path, world: str, name: str) -> pd.DataFrame:
+    """A table of a world, in which the learned β has the name that the claims have for it."""
+    return pd.read_csv(folder / world / name).replace({"variant": {WORLDS[world]: LEARNED}})
+
+
+def _runs(folder: Path, world: str, variants: Iterable[str]) -> pd.DataFrame:
     """A metrics.csv; `RecordError` unless each environment has as many runs of all `variants`."""
-    table = pd.read_csv(path)
+    path, table = folder / world / "metrics.csv", _read(folder, world, "metrics.csv")
     for environment, own in table.groupby("env"):
         counts = own["variant"].value_counts().reindex([*variants], fill_value=0)
         if counts.nunique() > 1 or not counts.iloc[0]:
@@ -186,7 +192,7 @@ def main() -> None:
     except (Refusal, OSError) as error:
         sys.exit(f"worlds: {error}")
     if not made:
-        sys.exit(f"worlds: {folder} has no {WORLDS[0]}/metrics.csv, nor that of another world")
+        sys.exit(f"worlds: {folder} has no {[*WORLDS][0]}/metrics.csv, nor that of another world")
     print(*(folder / FOLDER / name for name in made), sep="\n")
 
 

@@ -103,7 +103,7 @@ def paying(extrinsic_return: float) -> Episode:
 def test_random_is_uniform_from_its_own_generator():
     rule, found = RandomBeta(np.random.default_rng(5), low=0.2, high=0.7), []
     for _ in range(300):
-        found.append(rule.beta)
+        found.append(rule.next_beta())
         rule.next_episode(paying(1.0), np.zeros(1))
     assert found == np.random.default_rng(5).uniform(0.2, 0.7, 300).tolist()
 
@@ -131,7 +131,7 @@ def test_bandit_equals_the_formula_on_its_whole_history(spread, window, explorat
                 bounds.append(np.mean(paid) + exploration * len(paid) ** -0.5 if paid else new)
             arms.append(bounds.index(max(bounds)))
         for value in pair:
-            assert bandit.beta == ARMS[arms[n]]
+            assert bandit.next_beta() == ARMS[arms[n]]
             bandit.next_episode(paying(value), np.zeros(1))
         bandit.end_rollout()
     assert set(arms) == {0, 1, 2, 3}

@@ -279,11 +279,9 @@ class PublishedTrainer(Trainer):
         config, environment = self.config, self.environment
         assert config.published is not None
         # Not before: a variant of config.yaml that is not asked for may have one of these.
-        refused = "beta.kind is 'pretrained'" if config.beta.kind == "pretrained" else ""
         if isinstance(config.beta, MetaBeta) and config.beta.objective:
-            refused = f"beta.objective is {config.beta.objective.kind!r}"
-        if refused:
-            raise ConfigError(f"{refused}, which trainer: published does not know")
+            reason = f"{config.beta.objective.kind!r}, which trainer: published does not know"
+            raise ConfigError(f"beta.objective is {reason}")
         self.settings, bonus = config.published, config.beta.kind != "none"
         self.curiosity = Curiosity(config.published, environment) if bonus else None
         own = environment, config.published.dropout, streams["meta"]

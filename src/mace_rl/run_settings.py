@@ -15,7 +15,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from pydantic import Field, ValidationError
 
-from mace_rl.config.beta import MetaConfig, PretrainedConfig
+from mace_rl.config.beta import MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.plugins import import_module, source_files
 from mace_rl.config.reading import Settings, merge, read_yaml
@@ -96,7 +96,6 @@ class LeftOut(Section):
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
-    pretrained: PretrainedConfig | None = None
 
 
 def _resolve(given: RunSettings, environment: str, variant: str, changes: Settings) -> RunConfig:

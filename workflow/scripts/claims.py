@@ -16,7 +16,8 @@ from mace_study.show import markdown, sections
 
 with job(snakemake):
     found, given = snakemake.input, snakemake.params
-    settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
+    settings = MetricsConfig.model_validate(given.settings)
+    paper = parse_claims(found.claims, settings.learned)
     runs = read_metrics(found.metrics, given.runs, settings)
     betas = read_table(found.betas, betas_columns(settings))
     runs = runs.merge(betas, how="left", on=["env", "variant", "seed"], validate="1:1")

@@ -13,7 +13,8 @@ from mace_study.show import animations, curves, report, sections
 
 with job(snakemake):
     found, given, output = snakemake.input, snakemake.params, Path(snakemake.output[0]).absolute()
-    settings, paper = MetricsConfig.model_validate(given.settings), parse_claims(found.claims)
+    settings = MetricsConfig.model_validate(given.settings)
+    paper = parse_claims(found.claims, settings.learned)
     data, answers = sections.read_data(dict(found.items()), given.runs, settings)
     ppo = {env: PPOConfig.model_validate(own) for env, own in given.ppo.items()}
     records = [read_record(Path(record)) for record in found.records]

@@ -12,7 +12,8 @@ with job(snakemake):
     given, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(given.settings)
     data = read_data(dict(snakemake.input.items()), given.runs, settings)
-    source = pictures.Source(*data, settings, parse_claims(snakemake.input.claims))
+    paper = parse_claims(snakemake.input.claims, settings.learned)
+    source = pictures.Source(*data, settings, paper)
     picture = pictures.PICTURES[snakemake.wildcards.picture]
     table = picture.data(source)
     write_atomically(output.data, table.to_csv(index=False))

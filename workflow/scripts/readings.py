@@ -13,7 +13,8 @@ with job(snakemake):
     found, given, output = snakemake.input, snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(given.settings)
     runs = read_runs(found.records, given.runs, given.run_settings)
-    table = readings(runs, settings, parse_claims(found.claims).table1)
+    paper = parse_claims(found.claims, settings.learned)
+    table = readings(runs, settings, paper.table1)
     write_atomically(output.data, table.to_csv(index=False))
     figure = pictures.draw_readings(table, curves.plot_style(settings, **given.style))
     curves.save_figure(figure, output.png, output.pdf)  # the first layout differs a little

@@ -14,7 +14,7 @@ from mace_study.show.latex import table1_latex
 with job(snakemake):
     given, output = snakemake.params, snakemake.output
     settings = MetricsConfig.model_validate(given.settings)
-    paper = parse_claims(snakemake.input.claims).table1
+    paper = parse_claims(snakemake.input.claims, settings.learned).table1
     runs = read_metrics(snakemake.input.metrics, given.runs, settings)
     made = {"comparisons": comparisons(runs, settings), "aggregate": aggregate(runs, settings)}
     made["table1"], made["supplement"] = split(summary(runs, settings, paper), paper)

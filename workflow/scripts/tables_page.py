@@ -8,8 +8,9 @@ from mace_study.config.metrics import MetricsConfig
 from mace_study.show import markdown, sections
 
 with job(snakemake):
-    given, paper = snakemake.params, parse_claims(snakemake.input.claims)
+    given = snakemake.params
     settings = MetricsConfig.model_validate(given.settings)
+    paper = parse_claims(snakemake.input.claims, settings.learned)
     data, answers = sections.read_data(dict(snakemake.input.items()), given.runs, settings)
     shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings, {})]
     origin = f"`{given.command}`: {len(given.runs)} runs."

@@ -36,8 +36,7 @@ def kernels() -> str:
 def files(part: str) -> list[Path]:
     """The source files of `PACKAGES[part]`."""
     folders = [PACKAGE.parent / name for name in PACKAGES[part]]
-    found = [file for folder in folders for file in folder.rglob("*.py")]
-    return sorted([*found, *PACKAGE.rglob("*.npz")])  # the pretrained LSTM's weights
+    return sorted(file for folder in folders for file in folder.rglob("*.py"))
 
 
 def meaning(file: Path) -> bytes:

@@ -24,15 +24,15 @@ class BetaController(ABC):
 
     learns = False  # whether `learn` wants policy gradients
     one_at_a_time = False  # whether every episode has to end before the next begins
+    needs_budget = False  # whether it is made with episodes=, how many the run will have
 
-    @property
     @abstractmethod
-    def beta(self) -> float:
-        """β of the next episode, in [0, 10]; the paper has at most 1."""
+    def next_beta(self) -> float:
+        """β of the next episode, in [0, 10]; the paper has at most 1. Asked once, before it."""
 
     @abstractmethod
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
-        """Take in a finished episode and its curiosity bonus, [T]; `beta` is then the next's."""
+        """Take in a finished episode and its curiosity bonus, [T]."""
 
     def end_rollout(self) -> None:
         """After the last `next_episode` before an update of the policy, and before `learn`."""

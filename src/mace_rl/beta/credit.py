@@ -1,4 +1,4 @@
-"""The credit of β: what it did to the extrinsic return, update by update, and what that adds up to.
+"""The credit of β: what it did to the extrinsic return; and two readings that learn from it.
 
 The update on rollout n moves the policy along P g(β), with g the policy gradient of the total
 advantage and P what Adam multiplies by. How the extrinsic return of the policies that result
@@ -18,12 +18,7 @@ from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaGradient
 from mace_rl.beta.objectives import Lesson, Objective, Played, evenly
 from mace_rl.beta.squash import natural_log
-from mace_rl.config.beta import (
-    CreditConfig,
-    CreditObjective,
-    EvidenceObjective,
-    PretrainedConfig,
-)
+from mace_rl.config.beta import CreditConfig, EvidenceObjective
 from mace_rl.numerics.matmul import dot
 
 SIZE_DECAY = 0.99  # of the running mean that says how large outputs usually are, per credit
@@ -84,37 +79,6 @@ class Judge(Stateful):
         return min(max(credit / math.sqrt(self.horizon), -self.bound), self.bound)
 
 
-class Integrator(Stateful):
-    """Adds up n credits c, and moves β's logit once they say more than chance would.
-
-    z = Σc / √max(Σc², N / 2) is the sum in units of its noise, N the number of credits that the
-    whole training will have. At the end it is about standard normal if β changed nothing; earlier
-    it is smaller, so that β does not wander. Below the threshold the logit stays; beyond it
-    follows z.
-    """
-
-    STATE = ("count", "expected", "sum", "squares")
-
-    def __init__(self, config: PretrainedConfig) -> None:
-        self.gain, self.threshold = config.credit_gain, config.credit_threshold
-        self.count, self.expected, self.sum, self.squares = 0, 0.0, 0.0, 0.0
-
-    def add(self, credit: float, progress: float) -> None:
-        """Take in one more credit; progress: the share of the training that is over, above 0."""
-        self.count += 1
-        self.expected = self.count / progress
-        self.sum += credit
-        self.squares += credit * credit
-
-    @property
-    def logit(self) -> float:
-        """What the credits add to the logit of β."""
-        if self.count == 0:
-            return 0.0
-        z = self.sum / math.sqrt(max(self.squares, self.expected / 2))
-        return math.copysign(self.gain * max(abs(z) - self.threshold, 0.0), z)
-
-
 class Credit(Objective):
     """L = −c o: the credit c of β, a meta-gradient of the extrinsic return (Xu et al. 2018).
 
@@ -122,11 +86,11 @@ class Credit(Objective):
     rollout, at most `sequences`.
     """
 
-    STATE = ("judge", "played", "judged")
+    STATE: tuple[str, ...] = ("judge", "played", "judged")
 
     asks_policy = True
 
-    def __init__(self, config: CreditObjective, sequences: int) -> None:
+    def __init__(self, config: CreditConfig, sequences: int) -> None:
         self.judge, self.most = Judge(config), sequences
         self.played: list[tuple[np.ndarray, float]] = []  # since the last update: read, output
         # Of each rollout whose β is being judged, the oldest first: what was read, mean output.

@@ -41,24 +41,23 @@ class MetaAdaptation(Stateful, BetaController):
         kind = CompiledMetaNetwork if engine == "compiled" else TorchMetaNetwork
         self.network: LearningNetwork = kind(config, self.reader.inputs, generator)
         self.sequence: np.ndarray | None = None  # what was read for the next β
-        self.output: float | None = None  # the network's for it, once somebody has asked
+        self.asked: tuple[np.ndarray, float, float] | None = None  # for the last: read, o and β
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """See `BetaController`."""
-        if self.sequence is None:
+        if self.sequence is None:  # the first episode's β is given
             return beta_of(self.initial_logit)
-        if self.output is None:
-            self.output = self.network.output(self.sequence)
-        return beta_of(self.initial_logit + self.objective.logit(self.output))
+        output = self.network.output(self.sequence)
+        beta = beta_of(self.initial_logit + self.objective.logit(output))
+        self.asked = self.sequence, output, beta
+        return beta
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
         """See `BetaController`."""
-        beta = self.beta
-        if self.sequence is not None and self.output is not None:  # the first episode's β was given
-            played = Played(self.sequence, self.output, beta, total(episode.rewards))
+        if self.asked is not None:
+            played = Played(*self.asked, total(episode.rewards))
             self.take(self.objective.after_episode(played))
-        self.sequence, self.output = self.reader.read(episode, bonus), None
+        self.sequence, self.asked = self.reader.read(episode, bonus), None
 
     def learn(
         self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
@@ -72,4 +71,3 @@ class MetaAdaptation(Stateful, BetaController):
         """Let the network learn."""
         if lesson is not None:
             self.network.learn(*lesson)
-            self.output = None

@@ -2,9 +2,9 @@
 
 The paper (supplement): "The network is trained with its own optimizer, separate from the main PPO
 agent, forming a meta-learning loop where the agent learns how to best guide its own exploration."
-It names no loss. Each class here is a loss L by what episodes return, and says its slope dL/do; o is
-the network's output, and β has the logit of the initial β plus o. Two more, by policy gradients, are
-in `beta.credit`.
+It names no loss. Each class here is a loss L by what episodes return, and says its slope dL/do. o
+is the network's output, and β has the logit of the initial β plus o. Two more, by policy gradients,
+are in `beta.credit`.
 """
 
 import math
@@ -114,12 +114,12 @@ class Perturbed(Objective):
 
     "the agent learns an optimal, non-stationary schedule for its curiosity bonus". o is perturbed
     by ξ, which is `noise` or −`noise` by chance for a window of episodes, then its opposite for the
-    next. A β acts in the update after its episode, and what that changes lasts: an episode's payment
-    p is for e, the mean of all ξ before it, of which the n-th last weighs (1 − 1/lag)ⁿ, in units of
-    `noise`. So −p e is dL/do on average, up to a factor.
+    next. A β acts in the update after its episode, and what that changes lasts: the payment p of an
+    episode is for e, the mean of all ξ before it, of which the n-th last weighs (1 − 1/lag)ⁿ, in
+    units of `noise`. So −p e is dL/do on average, up to a factor.
     """
 
-    STATE = ("generator", "perturbation", "episodes", "trace", "sequence")
+    STATE: tuple[str, ...] = ("generator", "perturbation", "episodes", "trace", "sequence")
 
     def __init__(self, config: PerturbedObjective, generator: np.random.Generator) -> None:
         self.config, self.generator = config, generator
@@ -153,7 +153,7 @@ class Perturbed(Objective):
 
 
 class Score(Perturbed):
-    """`Perturbed`, paid by returns: J is the mean return, the mean of the last ones its baseline."""
+    """`Perturbed`, paid by returns: J is their mean, and the mean of the last ones its baseline."""
 
     STATE = (*Perturbed.STATE, "returns")
 
@@ -182,13 +182,14 @@ class Progress(Perturbed):
 
     def __init__(self, config: ProgressObjective, generator: np.random.Generator) -> None:
         super().__init__(config, generator)
+        self.stretch = config.stretch
         self.returns: deque[float] = deque(maxlen=2 * config.stretch)
         self.rises: deque[float] = deque(maxlen=config.recent)
 
     def paid(self, extrinsic_return: float) -> float:
         """See `Perturbed`."""
         self.returns.append(extrinsic_return)
-        if len(self.returns) < 2 * self.config.stretch:
+        if len(self.returns) < 2 * self.stretch:
             return 0.0
         rise = difference(self.returns)
         result = in_units(rise, deviation(self.rises, 0.0)) if self.rises else 0.0

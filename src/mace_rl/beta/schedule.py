@@ -19,8 +19,7 @@ class ExponentialSchedule(Stateful, BetaController):
         self.config = config
         self.decayed = config.initial
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """β of the next episode."""
         return max(self.config.floor, self.decayed)
 
@@ -35,8 +34,7 @@ class Constant(BetaController):
     def __init__(self, config: ConstantBeta) -> None:
         self.config = config
 
-    @property
-    def beta(self) -> float:
+    def next_beta(self) -> float:
         """See `BetaController`."""
         return self.config.value
 

@@ -84,14 +84,6 @@ ByReturns = ReturnObjective | ScoreObjective | ProgressObjective | WordsObjectiv
 MetaObjective = ByReturns | CreditObjective | EvidenceObjective
 
 
-class PretrainedConfig(CreditConfig):
-    """A pretrained LSTM that reads how the training goes, and the credit of earlier βs: ours."""
-
-    lstm: bool  # false: none, in whose place stands the initial β
-    credit_gain: NonNegativeFloat  # of β's logit per unit of z beyond the threshold; 0: no credit
-    credit_threshold: NonNegativeFloat  # of |z|, the sum of the credits in units of its noise
-
-
 class NoBonus(Section):
     """Plain PPO: no curiosity, no memory, β = 0."""
 
@@ -130,17 +122,10 @@ class MetaBeta(Section):
     objective: MetaObjective | None = Field(default=None, discriminator="kind")  # what it learns
 
 
-class PretrainedBeta(Section):
-    """β by the pretrained LSTM; `initial` is β of the first hundredth of the training."""
-
-    kind: Literal["pretrained"]
-    initial: float = Field(gt=0, lt=1)
-
-
 class CustomBeta(Section):
     """β from the class `rule`, a `mace_rl.beta.controller.BetaController`.
 
-    It is made as rule(generator, **arguments).
+    It is made as rule(generator, **arguments), with episodes= of the run if it `needs_budget`.
     """
 
     kind: Literal["custom"]
@@ -149,4 +134,4 @@ class CustomBeta(Section):
 
 
 BetaRule = ConstantBeta | ExponentialBeta | CustomBeta
-BetaConfig = NoBonus | MetaBeta | PretrainedBeta | BetaRule
+BetaConfig = NoBonus | MetaBeta | BetaRule

@@ -92,7 +92,7 @@ def import_module(reference: str, key: str) -> ModuleType:
 
 
 def source_files(reference: str, key: str) -> list[Path]:
-    """The Python file of a module, without importing it; in a package all files in its folder."""
+    """The Python file of a module, without importing it; in a package all there, and weights."""
     _look_here_too()
     module = reference.partition(":")[0]
     try:
@@ -106,7 +106,7 @@ def source_files(reference: str, key: str) -> list[Path]:
         )
     file = Path(spec.origin)
     in_package = (file.parent / "__init__.py").exists()
-    return sorted(file.parent.glob("*.py")) if in_package else [file]
+    return sorted([*file.parent.glob("*.py"), *file.parent.glob("*.npz")]) if in_package else [file]
 
 
 def _look_here_too() -> None:

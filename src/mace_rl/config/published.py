@@ -21,7 +21,7 @@ class PublishedConfig(Section):
 
 
 # What else a run with this trainer is set to, since it computes nothing else.
-COMPUTED: dict[str, Any] = dict.fromkeys(["bonus", "memory", "novelty", "meta", "pretrained"]) | {
+COMPUTED: dict[str, Any] = dict.fromkeys(["bonus", "memory", "novelty", "meta"]) | {
     "engine": "torch",
     "ppo.network": TorchModule(kind="torch", module="mace_rl.published:Actor"),
     "ppo.hidden_units": [512, 256, 128, 64],

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, PositiveInt, model_validator
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.beta import BetaConfig, MetaBeta, MetaConfig, PretrainedConfig
+from mace_rl.config.beta import BetaConfig, MetaBeta, MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.published import COMPUTED, PublishedConfig
 from mace_rl.config.section import Arguments, Reference, Section, short_repr
@@ -21,7 +21,7 @@ from mace_rl.config.section import Arguments, Reference, Section, short_repr
 IDENTITY = ("environment", "variant", "seed")
 BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
 # Used only where beta.kind is one of these.
-BETA_SECTIONS = {"meta": ("meta",), "pretrained": ("pretrained",)}
+BETA_SECTIONS = {"meta": ("meta",)}
 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class AgentConfig(Section):
 class RunConfig(AgentConfig):
     """One training run: environment, variant, seed and every hyperparameter that it uses.
 
-    `bonus`, `memory`, `novelty`, `meta` and `pretrained` are there in variants that use them and
+    `bonus`, `memory`, `novelty` and `meta` are there in variants that use them and
     None in the others, so that a change of what a variant does not use leaves its runs alone.
     """
 
@@ -90,7 +90,6 @@ class RunConfig(AgentConfig):
     memory: MemoryConfig | None = None
     novelty: NoveltyConfig | None = None
     meta: MetaConfig | None = None
-    pretrained: PretrainedConfig | None = None
     beta: BetaConfig = Field(discriminator="kind")
 
     @model_validator(mode="before")

@@ -59,9 +59,8 @@ class CheckedBeta(Checked):
 
     part: BetaController
 
-    @property
-    def beta(self) -> float:
-        beta = float(numbers("β", self.part.beta, ()))
+    def next_beta(self) -> float:
+        beta = float(numbers("β", self.part.next_beta(), ()))
         require_within("β", beta, largest=LARGEST_BETA)
         return beta
 

@@ -17,7 +17,6 @@ from mace_rl.beta.controller import BetaController
 from mace_rl.beta.credit import Credit, Evidence
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.beta.objectives import Objective, Progress, Return, Score, Words
-from mace_rl.beta.pretrained import PretrainedAdaptation
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
@@ -32,15 +31,15 @@ from mace_rl.config.beta import (
     MetaBeta,
     MetaObjective,
     NoBonus,
-    PretrainedBeta,
     ProgressObjective,
     ReturnObjective,
     ScoreObjective,
     WordsObjective,
 )
 from mace_rl.config.bonus import CuriosityBonus, CustomBonus
-from mace_rl.config.plugins import make
+from mace_rl.config.plugins import load, make
 from mace_rl.config.run import AgentConfig, RunConfig
+from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
@@ -67,11 +66,8 @@ def unchecked_controller(
             learned = meta_objective(objective, config.meta.sequences, streams["exploration"])
             own = environment, config.engine, streams["meta"]
             return MetaAdaptation(config.meta, learned, initial, *own)
-        case PretrainedBeta(initial=initial):
-            assert config.pretrained is not None
-            return PretrainedAdaptation(config.pretrained, initial, config.episodes)
         case ConstantBeta() | ExponentialBeta() | CustomBeta() as rule:
-            return beta_rule(rule, streams["beta"])
+            return beta_rule(rule, streams["beta"], config.episodes)
         case NoBonus():
             raise ValueError("without a bonus there is no β")
 
@@ -95,15 +91,22 @@ def meta_objective(
             return Credit(settings, sequences)
 
 
-def beta_rule(settings: BetaRule, generator: np.random.Generator) -> BetaController:
-    """What sets β, unless it is learned from policy gradients."""
+def beta_rule(
+    settings: BetaRule, generator: np.random.Generator, episodes: int | None = None
+) -> BetaController:
+    """What sets β, unless it is the meta network; episodes: the budget, None if nobody knows it."""
     match settings:
         case ConstantBeta():
             return Constant(settings)
         case ExponentialBeta():
             return ExponentialSchedule(settings)
         case CustomBeta(rule=rule, arguments=arguments):
-            return make(rule, "beta.rule", BetaController, False, generator, **arguments)
+            budget = {}
+            if getattr(load(rule, "beta.rule"), "needs_budget", False):
+                if episodes is None:
+                    raise ConfigError(f"beta.rule has {rule!r}, which needs to know the budget")
+                budget = {"episodes": episodes}
+            return make(rule, "beta.rule", BetaController, False, generator, **budget, **arguments)
 
 
 def intrinsic_reward(

@@ -104,7 +104,7 @@ class Trainer:
         warn_of_rewards(self.config, unit, self.ppo.unit("extrinsic"), len(self.records) + 1)
         beta, bonus, intrinsic = 0.0, None, without_bonus(len(episode))
         if self.curiosity is not None and self.controller is not None:
-            beta, bonus = self.controller.beta, self.curiosity.bonus(episode)
+            beta, bonus = self.controller.next_beta(), self.curiosity.bonus(episode)
             intrinsic = self.ppo.advantages("intrinsic", observations, bonus.reward, ends)
             returns = discounted_returns(episode.rewards, self.config.ppo.discount)
             self.curiosity.remember(episode, returns)

@@ -95,7 +95,7 @@ class CuriosityTracker(Stateful):
         unfinished = self.recordings[environment]
         if unfinished is not None and unfinished.rewards and not afresh:
             self.end(environment, terminated=False)
-        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.beta
+        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.next_beta()
         require_within("β", beta, largest=LARGEST_BETA)
         baseline = self.bonus_sum / self.count if self.config.centred and self.count else 0.0
         self.recordings[environment] = Recording(beta, self.unit, baseline, [first])

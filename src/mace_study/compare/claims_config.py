@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -31,6 +31,7 @@ class Part(NamedTuple):
     in_paper: float  # variant - baseline in the paper's Table 1; NaN where that has none
 
 
+LEARNED = "mace_full"  # what the file calls the learned β
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 
 
@@ -186,14 +187,30 @@ def too_few(seeds: int) -> str:
     return f"that takes {FEWEST_SEEDS} seeds, and there are {seeds}"
 
 
-def parse_claims(path: str | Path) -> ClaimsConfig:
-    """The file at `path`, whatever study it is for; a `ConfigError` with its first mistake."""
-    return check(ClaimsConfig, read_yaml(Path(path)), str(path))
+def parse_claims(path: str | Path, learned: str = LEARNED) -> ClaimsConfig:
+    """The file at `path`, with `learned` as the learned β; a `ConfigError` with its first mistake.
+
+    The file calls that `LEARNED`. Another variant takes its place in every claim and in Table 1.
+    """
+    claims = check(ClaimsConfig, read_yaml(Path(path)), str(path))
+    if learned == LEARNED:
+        return claims
+    changed = claims.model_dump(include={"families", "table1"})
+    return check(ClaimsConfig, claims.model_dump() | _with_learned(changed, learned), str(path))
+
+
+def _with_learned(part: Any, learned: str) -> Any:
+    """Plain settings with another name for the learned β."""
+    if isinstance(part, dict):
+        return {_with_learned(key, learned): _with_learned(x, learned) for key, x in part.items()}
+    if isinstance(part, list):
+        return [_with_learned(one, learned) for one in part]
+    return learned if part == LEARNED else part
 
 
 def read_claims(study: "Study", path: str | Path) -> ClaimsConfig:
     """The file that a study names, checked against it; a `ConfigError` with its first mistake."""
-    claims = parse_claims(path)
+    claims = parse_claims(path, study.metrics.learned)
     try:
         _check_names(claims, study)
         _check_form(claims)

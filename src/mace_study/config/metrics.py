@@ -46,6 +46,7 @@ class MetricsConfig(Section):
     solved_return: dict[str, float] = Field(default={})  # from which on an episode is solved
     # Which variant is compared with which, [variant, baseline], where the study has both.
     comparisons: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
+    learned: str = "mace_full"  # the variant that is the learned β of the claims
     constants: ConstantsConfig | None = None  # None: there is no picture of them
     custom: list[Reference] = Field(default=[])  # each a mace_study.measure.metrics.Metric
 

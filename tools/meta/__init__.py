@@ -1,1 +1,0 @@
-"""The making of the meta network's weights: `python -m tools.meta --help`."""
