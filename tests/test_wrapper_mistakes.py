@@ -44,7 +44,7 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
     [
         *(
             ({"beta": {"kind": kind, "initial": 0.4}}, "asks for policy gradients and the budget")
-            for kind in ("meta", "pretrained", "hybrid")
+            for kind in ("meta",)
         ),
         ({"beta": LEARNS}, "beta.rule has 'test_extras:Noted', which learns from policy"),
         ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),

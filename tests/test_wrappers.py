@@ -2,6 +2,7 @@
 
 import copy
 import io
+import math
 
 import gymnasium
 import numpy as np
@@ -55,15 +56,25 @@ class ByEpisodes:
         self.sums = [[], []]  # discounted, of extrinsic rewards and of bonuses
         self.bonuses = []
 
-    def pay(self, episode: Episode) -> tuple[float, float, float, np.ndarray]:
-        """β, unit, mean, and the bonus with its factors, [T, 3]; then it is remembered."""
+    def usual(self, bonus: np.ndarray) -> np.ndarray:
+        """m before each step, [T]: of 20 steps the mean, then each weighs 19/20 of the next."""
+        found = []
+        for value in bonus:
+            old = np.array(self.bonuses)
+            recent = (19 / 20) ** np.arange(max(len(old) - 20, 0))[::-1] / 20
+            first = old[:20].mean() if len(old) else 0.0
+            found.append(first * (19 / 20) ** max(len(old) - 20, 0) + old[20:] @ recent)
+            self.bonuses.append(value)
+        return np.array(found)
+
+    def pay(self, episode: Episode) -> tuple[float, float, np.ndarray, np.ndarray]:
+        """β, unit, m of each step, and the bonus with its factors, [T, 3]; then it is kept."""
         bonus = self.curiosity.bonus(episode)
-        beta, unit, usual = self.beta.next_beta(), 0.0, np.mean(self.bonuses or [0.0])
-        self.bonuses += bonus.reward.tolist()
+        beta, unit, usual = self.beta.next_beta(), 0.0, self.usual(bonus.reward)
         if self.sums[0]:
-            extrinsic, intrinsic = (np.std(sums) for sums in self.sums)
-            unit = max(extrinsic, 1.0) / intrinsic
-        for sums, rewards in zip(self.sums, (episode.rewards, bonus.reward), strict=True):
+            size = math.sqrt((np.square(self.sums[1]).sum() + 100) / (len(self.sums[1]) + 100))
+            unit = max(np.std(self.sums[0]), 1.0) / size
+        for sums, rewards in zip(self.sums, (episode.rewards, bonus.reward - usual), strict=True):
             for t in range(len(episode)):
                 sums.append(sum(0.99 ** (t - k) * rewards[k] for k in range(t + 1)))
         ahead = range(len(episode))
@@ -103,7 +114,7 @@ def test_pays_what_the_trainer_s_curiosity_gives_for_whole_episodes(name, beta):
             assert info["reward_extrinsic"] == rewards[t] and info["beta"] == beta_now
             found = [info[part] for part in ("curiosity", "novelty", "relevance")]
             np.testing.assert_allclose(found, bonus[t], rtol=1e-4, atol=1e-5)
-            added = beta_now * unit * (info["curiosity"] - usual)
+            added = beta_now * unit * (info["curiosity"] - usual[t])
             assert info["reward_curiosity"] == pytest.approx(added, rel=1e-3, abs=1e-5)
             assert total == info["reward_extrinsic"] + info["reward_curiosity"]
         states, rewards, episodes = [bare.reset()[0]], [], episodes + 1
@@ -121,7 +132,7 @@ def test_an_episode_that_is_reset_early_is_not_learned_from_if_all_begins_afresh
     assert one == other
     states.append(env.state_dict())
     for state in states:
-        del state["recordings"], state["curiosity"]["memory"]["read"]
+        del state["recordings"], state["usual"], state["curiosity"]["memory"]["read"]
     assert archive(states[0]) == archive(states[1])
 
 

@@ -192,7 +192,9 @@ def main() -> None:
     except (Refusal, OSError) as error:
         sys.exit(f"worlds: {error}")
     if not made:
-        sys.exit(f"worlds: {folder} has no {[*WORLDS][0]}/metrics.csv, nor that of another world")
+        sys.exit(
+            f"worlds: {folder} has no {next(iter(WORLDS))}/metrics.csv, nor that of another world"
+        )
     print(*(folder / FOLDER / name for name in made), sep="\n")
 
 

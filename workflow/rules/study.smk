@@ -18,6 +18,7 @@ from mace_rl.environments import registered
 from mace_study.compare.claims_config import FEWEST_SEEDS, read_claims, too_few
 from mace_study.measure.metrics import all_metrics, out_of_reach
 from mace_rl.runs import provenance, slurm
+from mace_rl.runs.finished import in_the_way
 from mace_rl.base.code_digest import digest
 
 # Snakemake pastes this path into the shell commands of `script:` jobs, where a space would split it.

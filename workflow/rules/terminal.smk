@@ -117,9 +117,33 @@ def plan():
     ]
 
 
+def make_room():
+    """Set finished runs aside where they are to be trained anew; stop if they are another study's.
+
+    Snakemake deletes what a job makes before it begins.
+    """
+    due = [job for job in workflow.dag.needrun_jobs() if job.rule.name == "train"]
+    folders = [Path(RUN.format(**job.wildcards_dict)) for job in due]
+    configs = [run_config(job.wildcards).settings() for job in due]
+    found = in_the_way(zip(folders, configs))
+    others = {folder: why for folder, why in found.items() if why}
+    on_purpose = workflow.dag_settings.forceall or workflow.dag_settings.forcerun
+    if others and not (study.replace or on_purpose):
+        [(folder, why), *more] = others.items()
+        sys.exit(
+            f"Error: {folder} holds a finished run with other settings ({why})"
+            f"{f', like {len(more)} more' if more else ''}: give this study a folder of its own,"
+            " as in --config results=NAME, or replace them on purpose, --config replace=true"
+        )
+    for folder in found:
+        there = [name for name in (*files.RESULTS, files.RECORD) if (folder / name).exists()]
+        logger.info(f"set aside: {files.set_aside(folder, there)}")
+
+
 onstart:
     global lock
     lock = occupy(RESULTS)
+    make_room()
     planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": plan()}
     os.makedirs(f"{RESULTS}/logs", exist_ok=True)
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))

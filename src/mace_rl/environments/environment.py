@@ -16,7 +16,10 @@ from mace_rl.base.stdio import keep_open
 from mace_rl.config.plugins import import_module, make
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
+from mace_rl.environments.remembered import fractions, hold_still, remembered, restore
 from mace_rl.environments.spaces import Spaces
+
+LOST = "lost"  # a key of `Environment.memory`
 
 # Faster classes that behave the same to the bit.
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
@@ -68,6 +71,7 @@ class Environment(Spaces):
     """
 
     env: gymnasium.Env[Any, Any]
+    fresh: dict[str, bytes]  # the `fractions` of its wrappers at first
 
     def __init__(
         self,
@@ -120,6 +124,19 @@ class Environment(Spaces):
             if not isinstance(kept := self.env.unwrapped.np_random, np.random.Generator):
                 raise TypeError(f"np_random is a {type(kept).__name__}, not a Generator of NumPy's")
 
+        self.fresh = fractions(self.env)
+
+    def memory(self) -> dict[str, Any]:
+        """What it has learned, to play on with: `remembered`, and the name of what cannot be."""
+        now = fractions(self.env)
+        lost = [key.split()[1] for key in now if now[key] != self.fresh.get(key)]
+        return remembered(self.env) | ({LOST: lost[0]} if lost else {})
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        """Play on with what `memory` returned of a training, and learn no more."""
+        restore(self.env, memory)
+        hold_still(self.env)
+
     def reset(self) -> Any:
         """The first observation of an episode."""
         try:
@@ -137,17 +154,7 @@ class Environment(Spaces):
 
     def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
         """Observation, reward and flags, checked; `action` is the `number`th of an episode."""
-        try:
-            observation, reward, terminated, truncated, _ = self.env.step(action)
-        except Exception as error:
-            frame, _ = raised_in(error)
-            if "unpack" in str(error) and frame.f_globals["__name__"].startswith(UNPACKS):
-                raise ConfigError(
-                    f"environment {self.name!r}, step {number}: not (observation, reward, "
-                    f"terminated, truncated, info): {error}"
-                ) from error
-            error.add_note(f"in step {number} of an episode of {self.name}")
-            raise
+        observation, reward, terminated, truncated, _ = stepped(self.env, action, self.name, number)
         terminated = bool(self.number("terminated", terminated, number))
         truncated = bool(self.number("truncated", truncated, number))
         return observation, self.checked_reward(reward, number), terminated, truncated
@@ -155,3 +162,19 @@ class Environment(Spaces):
     @property
     def generator(self) -> np.random.Generator:
         return self.env.unwrapped.np_random
+
+
+def stepped(env: Any, action: Any, name: str, number: int) -> tuple[Any, Any, Any, Any, Any]:
+    """The five parts of an environment's step, the `number`th of an episode; else `ConfigError`."""
+    try:
+        observation, reward, terminated, truncated, info = env.step(action)
+    except Exception as error:
+        frame, _ = raised_in(error)
+        if "unpack" in str(error) and frame.f_globals["__name__"].startswith(UNPACKS):
+            raise ConfigError(
+                f"environment {name!r}, step {number}: not (observation, reward, "
+                f"terminated, truncated, info): {error}"
+            ) from error
+        error.add_note(f"in step {number} of an episode of {name}")
+        raise
+    return observation, reward, terminated, truncated, info

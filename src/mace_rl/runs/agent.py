@@ -4,6 +4,7 @@ policy = load_agent("results/runs/CartPole-v1/ppo/seed0").policy
 action = policy(observation).sample()
 """
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,15 @@ from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.base import files
 from mace_rl.base.rng import Streams
 from mace_rl.config.run import AgentConfig
+from mace_rl.environments.environment import LOST
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
 from mace_rl.training.factories import actor_critic, environment
+
+logger = logging.getLogger(__name__)
+ENVIRONMENT = "environment"  # the key in agent.pt of what the environment has learned
 
 
 class PolicyModule(TorchPolicy):
@@ -110,8 +115,10 @@ def load_agent(directory: str | Path, trust: bool = False) -> Agent:
 class Player:
     """The environment of a run and its agent, untrained at first, without a trainer."""
 
+    memory: dict[str, Any]  # what its environment learned; nothing of an untrained one
+
     def __init__(self, config: AgentConfig) -> None:
-        streams = Streams(config.seed)
+        streams, self.memory = Streams(config.seed), {}
         self.environment = environment(config, streams)
         if config.trainer == "published":
             self.networks = published.networks(config, self.environment, streams)
@@ -123,8 +130,13 @@ class Player:
     @classmethod
     def of(cls, run: FinishedRun) -> "Player":
         """With the trained agent of `run`; raises what `load_agent` raises."""
-        player = cls(run.agent_config)
-        player._load(run.agent_state, run.folder / files.AGENT)
+        player, state = cls(run.agent_config), dict(run.agent_state)
+        player.memory = state.pop(ENVIRONMENT, {})
+        player._load(state, run.folder / files.AGENT)
+        player.environment.recall(player.memory)
+        if lost := player.memory.get(LOST):
+            said = "%s: what %s learned in training is not in agent.pt, and it begins anew"
+            logger.warning(said, run.folder, lost)
         return player
 
     def _load(self, state: dict[str, Any], path: Path) -> None:

@@ -147,6 +147,21 @@ class FinishedRun:
         return unarchive(self.content(files.AGENT), self.folder / files.AGENT)
 
 
+def in_the_way(runs: Iterable[tuple[Path, Mapping[str, Any]]]) -> dict[Path, str]:
+    """The finished runs in folders where others are to be trained: how their settings differ.
+
+    runs: folders, and `RunConfig.settings` of what is to be trained there. "" for equal settings:
+    the code or its versions changed, or somebody wants it again.
+    """
+    found = {}
+    for folder, settings in runs:
+        if (folder / files.RECORD).exists():
+            own, wanted = read_record(folder / files.RECORD)["config"], dict(settings)
+            plain = json.loads(json.dumps(wanted))
+            found[folder] = "" if own == plain else difference(own, plain)
+    return found
+
+
 def read_runs(
     records: Iterable[str],
     runs: Iterable[tuple[str, str, int, int]],

@@ -24,7 +24,7 @@ from mace_rl.base.rng import Streams
 from mace_rl.config.run import IDENTITY, RunConfig
 from mace_rl.published import PublishedTrainer
 from mace_rl.runs import checkpoint, provenance
-from mace_rl.runs.agent import Agent
+from mace_rl.runs.agent import ENVIRONMENT, Agent
 from mace_rl.runs.finished import WAY_OUT, difference_from, finished
 from mace_rl.training import resuming
 from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
@@ -300,7 +300,10 @@ def write_results(
     """Write the records, the agent and, last, `run.json`; identity: with the code's commit."""
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
-    agent = checkpoint.archive(Agent(trainer.ppo, trainer.environment.given_space).state_dict())
+    state = Agent(trainer.ppo, trainer.environment.given_space).state_dict()
+    if memory := trainer.environment.memory():
+        state[ENVIRONMENT] = memory
+    agent = checkpoint.archive(state)
     write_atomically(directory / files.AGENT, agent)
     record = identity | {
         "threads": torch.get_num_threads(),

@@ -80,7 +80,7 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
             rendered = self.env.render()
             if rendered is None:
                 raise TypeError("render() gives no picture")
-            drawn = Image.fromarray(np.asarray(rendered, np.uint8))
+            drawn = Image.fromarray(as_bytes(np.asarray(rendered)))
         except Exception as error:  # renderers raise many types
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise RenderError(f"environment {self.name!r} cannot be drawn: {reason}") from error
@@ -93,6 +93,15 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         begun, self.begun = self.begun, self.begun + self.duration
         # A GIF has hundredths of a second.
         self.film.milliseconds.append(10 * (round(self.begun / 10) - round(begun / 10)))
+
+
+def as_bytes(frame: np.ndarray) -> np.ndarray:
+    """A frame as uint8; fractions from 0 to 1 are shares of 255. `ValueError` for other numbers."""
+    if frame.dtype.kind in "fb" and frame.size and frame.max() <= 1:
+        frame = frame * 255.0
+    if not (frame.dtype.kind in "uif" and frame.size and frame.min() >= 0 and frame.max() <= 255):
+        raise ValueError(f"render() gives {frame.dtype} outside 0 to 255, or no numbers")
+    return np.round(frame).astype(np.uint8)
 
 
 def film(
@@ -130,6 +139,7 @@ def film(
     except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
     environment.clips_actions = config.ppo.clip_actions
+    environment.recall(player.memory)
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
     with closing(filmed), nothing_printed(), seeded(globally):

@@ -1,6 +1,5 @@
 """The state of an environment: saved for resuming, checked by playing the last episodes again."""
 
-import copy
 import hashlib
 import itertools
 import random
@@ -13,6 +12,7 @@ import torch
 
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
+from mace_rl.environments.remembered import remembered, restore
 from mace_rl.training.rollout import roll_out
 
 EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
@@ -20,29 +20,22 @@ EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
 # nor do Gymnasium's plain wrappers around them.
 FORGETFUL = ("gymnasium.envs.classic_control.", "gymnasium.envs.toy_text.", "mace_rl.environments.")
 PLAIN_WRAPPERS = "gymnasium.wrappers.common"
-OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermost of its wrappers
 
 
 def state_of(environment: Environment, of_process: bool = True) -> dict[str, Any]:
     """What the next episode depends on, as far as it can be known.
 
-    The environment's generator, its own `state_dict()` if any, and, which takes longer, the global
+    The environment's generator, what is `remembered` of it, and, which takes longer, the global
     generators if `of_process`.
     """
-    env: Any = environment.env
-    offers = all(map(env.has_wrapper_attr, OFFERED))
-    state = {
-        "np_random": _plain(environment.generator.bit_generator.state),
-        "own": copy.deepcopy(env.get_wrapper_attr("state_dict")()) if offers else None,
-    }
+    generator = _plain(environment.generator.bit_generator.state)
+    state = {"np_random": generator, "remembered": remembered(environment.env)}
     return state | global_state() if of_process else state
 
 
 def set_state(environment: Environment, state: dict[str, Any]) -> None:
     """Restore what `state_of` returned."""
-    env: Any = environment.env
-    if state["own"] is not None:
-        env.get_wrapper_attr("load_state_dict")(copy.deepcopy(state["own"]))
+    restore(environment.env, state["remembered"])
     environment.generator.bit_generator.state = state["np_random"]
     if "random" in state:
         set_global_state(state)

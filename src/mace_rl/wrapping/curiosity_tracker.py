@@ -1,6 +1,7 @@
 """Curiosity while an episode is played: what the wrappers ask of it, step by step."""
 
 import copy
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -12,8 +13,7 @@ import torch
 from gymnasium.spaces import Discrete
 
 from mace_rl.agent.advantages import discounted_returns
-from mace_rl.agent.ppo import TINY
-from mace_rl.agent.scale import RewardScale
+from mace_rl.agent.scale import RewardScale, discounted_sums
 from mace_rl.base.rng import Streams
 from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController
@@ -23,12 +23,35 @@ from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
-from mace_rl.numerics.arrays import total
 from mace_rl.numerics.finite import require_within
+from mace_rl.numerics.matmul import dot
 from mace_rl.training.factories import beta_rule
+
+USUAL_STEPS = 20  # whose R_curiosity is usual
+PRIOR = 100  # sums of R_curiosity of size 1 that are taken for granted
 
 # What a step's `info` gets, float.
 PARTS = ("reward_extrinsic", "reward_curiosity", "curiosity", "novelty", "relevance", "beta")
+
+
+class Usual(Stateful):
+    """m: the mean R_curiosity of the last steps, later ones weighing more.
+
+    What is beyond it adds up to `USUAL_STEPS` times what m has changed by: next to nothing over
+    many steps, whether R_curiosity falls or rises.
+    """
+
+    STATE = ("mean", "steps")
+
+    def __init__(self) -> None:
+        self.mean, self.steps = 0.0, 0  # m; the steps that it has seen, at most `USUAL_STEPS`
+
+    def beyond(self, bonus: float) -> float:
+        """The part of a step's R_curiosity that is beyond m; then m takes it in."""
+        result = bonus - self.mean
+        self.steps = min(self.steps + 1, USUAL_STEPS)
+        self.mean += (bonus - self.mean) / self.steps
+        return result
 
 
 @dataclass
@@ -37,11 +60,11 @@ class Recording:
 
     beta: float
     unit: float  # see `CuriosityTracker.unit`
-    baseline: float  # R_curiosity that is paid with 0
     observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
     rewards: list[float] = field(default_factory=list)  # extrinsic
     bonus: list[float] = field(default_factory=list)  # R_curiosity
+    beyond: list[float] = field(default_factory=list)  # the part of it that is paid
 
     def __post_init__(self) -> None:
         self.visits = Counter(state.tobytes() for state in self.observations[1:])
@@ -60,14 +83,41 @@ class Recording:
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
         """From the tensors of `state_dict` as arrays."""
-        beta, unit, baseline, *lists = state.values()
-        return cls(beta.item(), unit.item(), baseline.item(), *map(list, lists))
+        beta, unit, *lists = state.values()
+        return cls(beta.item(), unit.item(), *map(list, lists))
+
+
+class CuriosityScale(Stateful):
+    """s_I: the size of what is paid, by the discounted sums of it in ended episodes.
+
+    It is their root mean square, as if `PRIOR` sums of 1 had come before, so that a few small ones
+    do not make it tiny.
+    """
+
+    STATE = ("squares", "count")
+
+    def __init__(self, discount: float) -> None:
+        self.discount = discount
+        self.squares, self.count = 0.0, 0  # of discounted sums
+
+    def update(self, beyond: np.ndarray) -> None:
+        """Take in what an ended episode paid, before β and u, [T]."""
+        sums = discounted_sums(beyond, self.discount)
+        self.squares, self.count = self.squares + dot(sums, sums), self.count + len(sums)
+
+    @property
+    def value(self) -> float:
+        """s_I."""
+        return math.sqrt((self.squares + PRIOR) / (self.count + PRIOR))
 
 
 class CuriosityTracker(Stateful):
     """The curiosity bonus for unfinished episodes of several environments."""
 
-    STATE = ("curiosity", "controller", "scales", "bonus_sum", "count", "recordings", "steps")
+    STATE = (
+        *("curiosity", "controller", "extrinsic", "scale", "usual", "usual_of_ended"),
+        *("recordings", "steps"),
+    )
 
     def __init__(self, config: CuriosityConfig, spaces: Spaces, environments: int) -> None:
         self.config, self.spaces = config, spaces
@@ -78,27 +128,32 @@ class CuriosityTracker(Stateful):
         self.controller = beta_rule(config.beta, streams["beta"])
         if isinstance(config.beta, CustomBeta):
             require_usable(config.beta.rule, self.controller, environments)
-        smallest = {"extrinsic": 1.0, "curiosity": TINY}
-        self.scales = {kind: RewardScale(config.discount, x) for kind, x in smallest.items()}
-        self.bonus_sum, self.count = 0.0, 0  # R_curiosity of all ended episodes, and their steps
+        self.extrinsic = RewardScale(config.discount, 1.0)
+        self.scale = CuriosityScale(config.discount)
+        self.usual, self.usual_of_ended = Usual(), Usual()  # of all steps, of ended episodes
         self.recordings: list[Recording | None] = [None] * environments
         self.steps = 0  # of whole episodes since the agent's last update
 
     @property
     def unit(self) -> float:
         """The extrinsic reward that 1 of R_curiosity is worth; 0 before any episode has ended."""
-        extrinsic, curiosity = self.scales.values()
-        return extrinsic.value / curiosity.value if extrinsic.sums.count else 0.0
+        return self.extrinsic.value / self.scale.value if self.extrinsic.sums.count else 0.0
 
     def begin(self, environment: int, observation: Any, afresh: bool = False) -> None:
         """Start an episode; one that is not over ends here, or, if all is afresh, is forgotten."""
         unfinished = self.recordings[environment]
         if unfinished is not None and unfinished.rewards and not afresh:
             self.end(environment, terminated=False)
+        if afresh:
+            self.usual = copy.copy(self.usual_of_ended)
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.next_beta()
         require_within("β", beta, largest=LARGEST_BETA)
-        baseline = self.bonus_sum / self.count if self.config.centred and self.count else 0.0
-        self.recordings[environment] = Recording(beta, self.unit, baseline, [first])
+        self.recordings[environment] = Recording(beta, self.unit, [first])
+
+    def steps_of(self, environment: int) -> int:
+        """Steps of its unfinished episode."""
+        recording = self.recordings[environment]
+        return len(recording.rewards) if recording else 0
 
     def as_recorded(self, action: Any) -> Any:
         """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
@@ -130,7 +185,9 @@ class CuriosityTracker(Stateful):
         recording.observations.append(state)
         recording.rewards.append(reward)
         recording.bonus.append(bonus)
-        paid = recording.beta * recording.unit * (bonus - recording.baseline)
+        beyond = self.usual.beyond(bonus)
+        recording.beyond.append(beyond if self.config.centred else bonus)
+        paid = recording.beta * recording.unit * recording.beyond[-1]
         values = (reward, paid, bonus, novelty, relevance, recording.beta)
         return dict(zip(PARTS, values, strict=True))
 
@@ -140,9 +197,10 @@ class CuriosityTracker(Stateful):
         assert recording is not None
         self.recordings[environment] = None
         episode, bonus = recording.episode(terminated), np.array(recording.bonus)
-        self.scales["extrinsic"].update(episode.rewards)
-        self.scales["curiosity"].update(bonus)
-        self.bonus_sum, self.count = self.bonus_sum + total(bonus), self.count + len(episode)
+        self.extrinsic.update(episode.rewards)
+        self.scale.update(np.array(recording.beyond))
+        for one in recording.bonus:
+            self.usual_of_ended.beyond(float(one))
         self.curiosity.remember(episode, discounted_returns(episode.rewards, self.config.discount))
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
@@ -157,7 +215,7 @@ class CuriosityTracker(Stateful):
             "observation_size": self.spaces.observation_size,
             "observation_space": repr(self.spaces.given_space),
             "environments": len(self.recordings),
-            "form": 9,  # of the state itself
+            "form": 10,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -6,18 +6,20 @@
 
 R_curiosity, in [0, 1], and β are the trainer's. The trainer weighs advantages in units of their
 scale; a wrapper sees rewards only, and leaves the extrinsic one as it is. So u brings the bonus to
-its unit: s_E and s_I are the standard deviations of the discounted sums of either reward in all
-episodes so far (`RewardScale`), s_E at least 1. With β = 0.4 the sums of the bonus vary 0.4 times
-as much as those of the extrinsic reward, or 0.4 if these vary by less than 1.
+its unit: s_E is the standard deviation of the discounted sums of the extrinsic reward in all
+episodes so far (`RewardScale`), at least 1, and s_I the size of those of R_curiosity - m
+(`CuriosityScale`). With β = 0.4 the bonus is 0.4 times as large as the extrinsic reward, or 0.4 if
+that varies by less than 1.
 
-m is the mean of R_curiosity in all episodes so far. Without it every step would pay, and an agent
-with one critic would rather not end an episode: docs/wrappers.md has what was measured. The trainer
-has a critic for each reward. `centred=False` leaves m out, as in the paper.
+m is the mean of R_curiosity over the last twenty steps or so. Without it every step would pay, and
+an agent with one critic would rather not end an episode; with the mean of all steps so far every
+step would cost, since novelty falls: docs/wrappers.md has what was measured. The trainer has a
+critic for each reward. `centred=False` leaves m out, as in the paper.
 
-β, u and m are constant during an episode. At its end the episode becomes memory, novelty is
-updated, and all three are set for the next. In the first episode u is 0: no bonus is paid yet. An
-episode that is reset before it ends, as by a time limit around this wrapper, ends there; where
-`reset` gets a seed, so that all begins afresh, it is forgotten.
+β and u are constant during an episode. At its end the episode becomes memory, novelty is updated,
+and both are set for the next. In the first episode u is 0: no bonus is paid yet. An episode that is
+reset before it ends, as by a time limit around this wrapper, ends there; where `reset` gets a seed,
+so that all begins afresh, it is forgotten.
 """
 
 from collections.abc import Mapping
@@ -31,7 +33,9 @@ from gymnasium.vector.utils import iterate
 
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
+from mace_rl.environments.environment import stepped
 from mace_rl.environments.spaces import Spaces
+from mace_rl.runs.checkpoint import require_plain
 from mace_rl.wrapping.curiosity_tracker import PARTS, CuriosityTracker
 
 Settings = Mapping[str, Any]
@@ -58,6 +62,8 @@ class CuriosityMixin(RecordConstructorArgs):
         super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]  # Gymnasium's
         config = check(CuriosityConfig, settings, type(self).__name__)
         count, spaces = 1, (env.observation_space, env.action_space)
+        if autoresets(env):
+            raise ConfigError("Autoreset belongs outside: Autoreset(CuriosityReward(env))")
         if isinstance(env, VectorEnv):
             count, spaces = env.num_envs, (env.single_observation_space, env.single_action_space)
             self.mode = env.metadata.get("autoreset_mode")
@@ -72,9 +78,12 @@ class CuriosityMixin(RecordConstructorArgs):
         """Everything that the bonus depends on, the unfinished episode included.
 
         Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
-        `weights_only`. The states of the environment and the agent are not in it.
+        `weights_only`; `CheckpointError` if a rule for β has others. The states of the environment
+        and the agent are not in it.
         """
-        return self.tracker.state_dict()
+        state = self.tracker.state_dict()
+        require_plain(state, "the state")
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned; `ConfigError` if other settings made it."""
@@ -89,7 +98,7 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
         reset: nothing is learned from one that does not.
     beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …} or "custom". Not "meta", "pretrained" or "hybrid": policy gradients.
-    centred: False to pay R_curiosity itself, not what it is beyond its mean.
+    centred: False to pay R_curiosity itself, not what it is beyond its present mean.
     relevance: False for novelty alone, without memory; `memory` is then refused.
     memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
     discount: γ of the agent (gamma in stable-baselines3), per step.
@@ -117,7 +126,8 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """The environment's step, with another reward and more in `info`."""
         recorded = self.tracker.as_recorded(action)
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        taken = stepped(self.env, action, self.tracker.spaces.name, self.tracker.steps_of(0) + 1)
+        observation, reward, terminated, truncated, info = taken
         parts = self.tracker.reward_parts(0, recorded, reward, observation)
         if terminated or truncated:
             self.tracker.end(0, bool(terminated))
@@ -155,10 +165,24 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """The environments' step, with other rewards, float64, and more in `infos`."""
         recorded = [self.tracker.as_recorded(action) for action in actions]
-        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        name = self.tracker.spaces.name
+        number = 1 + max(map(self.tracker.steps_of, range(self.num_envs)))
+        observations, rewards, terminated, truncated, infos = stepped(
+            self.env, actions, name, number
+        )
+        if not isinstance(infos, Mapping):
+            raise ConfigError(
+                f"environment {name!r} gave {type(infos).__name__} as infos of its step, but they "
+                "should be a mapping from names to arrays"
+            )
         ended = terminated | truncated
         reached = seen = self._apart(observations)
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
+            if "final_obs" not in infos:
+                raise ConfigError(
+                    f"environment {name!r} declares AutoresetMode.SAME_STEP, but the infos of a "
+                    "step that ends an episode have no 'final_obs'"
+                )
             final = self._apart(infos["final_obs"])
             reached = [final[i] if ended[i] else seen[i] for i in range(self.num_envs)]
         over = np.array([recording is None for recording in self.tracker.recordings])
@@ -185,6 +209,15 @@ def given(arguments: dict[str, Any]) -> dict[str, Any]:
         for name, value in found.items()
         if value is not None or name not in ("memory", "novelty")
     }
+
+
+def autoresets(env: Any) -> bool:
+    """Whether `gymnasium.wrappers.Autoreset` is among an environment's wrappers."""
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, gymnasium.wrappers.Autoreset):
+            return True
+        env = env.env
+    return False
 
 
 def name_of(env: Any) -> str:

@@ -63,6 +63,8 @@ class Study(RunSettings):
     """All runs of a study, each environment × variant × seed, and how they are evaluated."""
 
     results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
+    # Whether finished runs in `results` that have other settings are set aside and trained anew.
+    replace: bool = False
     environments: Names
     variants: Names
     seeds: Seeds
