@@ -1,0 +1,74 @@
+"""The ceiling: forks that repeat themselves, and an oracle that gains nothing where nothing helps."""
+
+import numpy as np
+import pytest
+from shared import finish
+
+from mace_rl.bonus.flag import FlagNovelty
+from mace_rl.library import settings
+from mace_rl.training.trainer import Trainer
+from tools import ceiling
+
+
+class NoBonus(FlagNovelty):
+    """A novelty that is 0: β has nothing to weigh."""
+
+    def __call__(self, states):
+        return np.zeros(len(states))
+
+
+def test_a_fork_goes_on_from_the_state_with_other_random_numbers():
+    config = settings("CartPole-v1", "mace_fixed", seed=800, episodes=12)
+    trainer = finish(ceiling.with_beta(config, 0.4))
+    state = trainer.state_dict()
+    forks = [
+        ceiling.go_on(ceiling.with_beta(config, beta), state, stream, 5)
+        for beta, stream in ((0.0, 1), (0.0, 1), (0.0, 2), (1.0, 1))
+    ]
+    told = [ceiling.returns(fork, 12).tolist() for fork in forks]
+    assert all(fork.records[:12] == trainer.records for fork in forks)
+    assert told[0] == told[1] != told[2] and len(told[0]) == 5
+    assert [record.beta for record in forks[3].records[10:]] == [0.4, 0.4, 1, 1, 1, 1, 1]
+    again = Trainer(ceiling.with_beta(config, 0.4))
+    again.load_state_dict(state)
+    assert again.records == trainer.records  # forks have not changed it
+
+
+def test_effect_and_noise_by_hand():
+    """Two forks, four βs, two streams, 20 episodes: β = 1 earns 3 more in the first 10 of them."""
+    forks = np.zeros((2, 4, 2, 20))
+    forks[:, -1, :, :10] = 3
+    forks[:, :, 0] += 1
+    found = list(ceiling.effects(forks))
+    assert [stretch for stretch, *_ in found] == [1, 10, 20]
+    assert [effect for _, effect, _ in found] == pytest.approx([3, 3, 1.5])
+    assert [noise for *_, noise in found] == pytest.approx([np.std([0, 1], ddof=1)] * 3)
+    assert ceiling.comparisons(1.0, 1.0) == pytest.approx(15.7, abs=0.01)  # two samples, textbook
+
+
+@pytest.mark.slow
+def test_where_beta_has_no_effect_the_oracle_gains_nothing(monkeypatch):
+    """What is reported is not what was chosen by: its mean is that of a constant, by chance."""
+    monkeypatch.setattr(ceiling, "STEP", 3)
+    monkeypatch.setattr(ceiling, "LAST", 15)
+    monkeypatch.setattr(ceiling, "STREAMS", 2)
+    novelty = {"kind": "custom", "estimator": "test_ceiling:NoBonus"}
+    gains, chosen = [], []
+    for seed in range(800, 830):
+        config = settings("CartPole-v1", "mace_fixed", seed=seed, novelty=novelty)
+        mean, forks = ceiling.oracle(config, 10)
+        constant = ceiling.with_beta(config.model_copy(update={"episodes": 15}), 0.4)
+        expected = ceiling.returns(finish(constant), 0).mean()
+        gains.append(mean - expected)
+        chosen.append(forks.mean(axis=(2, 3)).max(axis=1).mean() - forks.mean())
+    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
+    assert abs(np.mean(gains)) < 2 * error
+    assert np.mean(chosen) > 2 * error  # by which chance alone seems to gain
+
+
+def test_a_mistake_gets_one_line(monkeypatch, capsys, tmp_path):
+    words = ["ceiling", "CartPole-v1", str(tmp_path / "x.csv"), "--seeds", "3", "3"]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit):
+        ceiling.main()
+    assert "--seeds should be FIRST < END" in capsys.readouterr().err
