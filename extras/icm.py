@@ -93,7 +93,10 @@ class ICM(PredictionError):
 
         taken = action.argmax(1) if self.discrete else action
         weights, unused = np.full(count, (weight - 1) / count, np.float32), self.log_std.copy()
-        grad, _ = log_prob_gradient(inverse.outputs, self.log_std, taken, weights, 0.0, unused)
+        none = np.empty(0, np.int64)
+        grad, _ = log_prob_gradient(
+            inverse.outputs, self.log_std, taken, weights, 0.0, unused, none
+        )
         grad_action = np.ascontiguousarray(grad[:, : action.shape[1]])
         grad_predicted = np.float32(weight / count) * (forward.outputs - after)
         inverse_gradient, to_both = self.inverse_model.gradients(inverse, grad_action)

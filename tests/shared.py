@@ -24,6 +24,7 @@ from matplotlib.text import Text
 
 from mace_rl import cli
 from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
+from mace_rl.agent.torch_policy import Categoricals
 from mace_rl.base.files import LOCK
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
@@ -77,6 +78,7 @@ class Twin:
     def __init__(self, owner: Network | Policy) -> None:
         self.network = getattr(owner, "network", owner)
         self.module = copy.deepcopy(self.network.module()).double()
+        self.parts = getattr(owner, "parts", np.zeros(0, int)).tolist()
         log_std = getattr(owner, "log_std", np.zeros(0, np.float32))  # empty: categorical
         self.log_std = torch.nn.Parameter(torch.from_numpy(log_std.astype(np.float64)))
 
@@ -102,6 +104,8 @@ class Twin:
     def policy(self, observations: np.ndarray) -> torch.distributions.Distribution:
         """π(·|s) as torch.distributions has it."""
         outputs = self(observations)
+        if len(self.parts):
+            return Categoricals(outputs, self.parts)
         if len(self.log_std):
             normal = torch.distributions.Normal(outputs, self.log_std.exp())
             return torch.distributions.Independent(normal, 1)
@@ -130,7 +134,7 @@ def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> Ac
     """The policy for rollouts, as its learner gives it."""
     normalisation = Normalisation.of(mean, std, clip)
     if isinstance(policy.network, CompiledMLP):
-        return CompiledActing.of(policy.network, policy.log_std, normalisation)
+        return CompiledActing.of(policy.network, policy.log_std, policy.parts, normalisation)
     return NetworkActing(policy, normalisation)
 
 

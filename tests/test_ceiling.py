@@ -1,4 +1,4 @@
-"""The ceiling: forks that repeat themselves, and an oracle that gains nothing where nothing helps."""
+"""The ceiling: forks repeat themselves; the oracle gains nothing where nothing helps."""
 
 import numpy as np
 import pytest

@@ -13,6 +13,7 @@ from mace_rl.agent.compiled_learner import CompiledLearner
 from mace_rl.agent.policy import Policy
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.run import RunConfig
+from mace_rl.environments.actions import Actions
 from mace_rl.numerics.adam import Adam
 from mace_rl.numerics.network import CompiledMLP, mlp
 from mace_rl.training.experience import Experience
@@ -28,7 +29,7 @@ class SmallProblem:
 
     def __init__(self, config: PPOConfig, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        self.actor = Policy(CompiledMLP(mlp([3, 5, 2], 1.0, rng)), Discrete(2), 0.0)
+        self.actor = Policy(CompiledMLP(mlp([3, 5, 2], 1.0, rng)), Actions("", Discrete(2)), 0.0)
         self.learner = CompiledLearner(config, self.actor, {})
         own = Twin(self.actor).own()
         self.parameters = 0.7 * rng.standard_normal(len(own)) * own

@@ -1,16 +1,24 @@
 """The policy: against torch.distributions, autograd and the textbook's statements."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from shared import ENGINES, Twin, acting
 
 from mace_rl.agent.distribution import log_prob_gradient
 from mace_rl.agent.policy import CompiledActing, NetworkActing, Policy
+from mace_rl.environments.actions import Actions
 from mace_rl.numerics.network import mlp
 
-SPACES = {"Discrete": Discrete(4), "Box": Box(-1, 1, (3,), np.float32)}
+SPACES = {
+    "Discrete": Discrete(4),
+    "MultiDiscrete": MultiDiscrete([3, 2, 4]),
+    "MultiBinary": MultiBinary(5),
+    "Box": Box(-1, 1, (3,), np.float32),
+}
 SIZE = 5
 
 both_engines = pytest.mark.parametrize("engine", ENGINES)
@@ -20,8 +28,8 @@ both_spaces = pytest.mark.parametrize("space", SPACES)
 def random_policy(space="Discrete", engine="compiled", hidden=(7, 6), scale=1.0, seed=0) -> Policy:
     """A policy all of whose parameters, biases and log-std included, are arbitrary."""
     rng = np.random.default_rng(seed)
-    outputs = 4 if space == "Discrete" else 3
-    policy = Policy(ENGINES[engine](mlp([SIZE, *hidden, outputs], 1.0, rng)), SPACES[space], 0.0)
+    actions = Actions("a test's", SPACES[space])
+    policy = Policy(ENGINES[engine](mlp([SIZE, *hidden, actions.outputs], 1.0, rng)), actions, 0.0)
     policy.parameters[:] = scale * rng.standard_normal(len(policy.parameters))
     policy.parameters *= Twin(policy).own()
     return policy
@@ -36,6 +44,8 @@ def steps(policy: Policy, count=50, seed=1):
     observations = rng.standard_normal((count, SIZE)).astype(np.float32)
     if policy.discrete:
         return observations, rng.integers(4, size=count)
+    if len(policy.parts):
+        return observations, rng.integers(policy.parts, size=(count, len(policy.parts)))
     return observations, rng.standard_normal((count, 3)).astype(np.float32)
 
 
@@ -49,6 +59,24 @@ def test_a_new_policy_is_nearly_uniform(make_ppo):
     assert len(policy.log_std) == 0 and (gaussian.log_std == np.float32(-0.7)).all()
 
 
+def apart(logits: torch.Tensor, sizes: list[int], space: str) -> SimpleNamespace:
+    """Independent categoricals, or Bernoullis of the differences of two logits, by torch alone."""
+    each = logits.split(sizes, -1)
+    if space == "MultiBinary":
+        differences = [part[:, 1] - part[:, 0] for part in each]
+        each = [torch.distributions.Bernoulli(logits=one) for one in differences]
+    else:
+        each = [torch.distributions.Categorical(logits=part) for part in each]
+
+    def log_prob(values: torch.Tensor) -> torch.Tensor:
+        columns = values.unbind(-1)
+        if space == "MultiBinary":
+            columns = [column.double() for column in columns]
+        return sum(one.log_prob(own) for one, own in zip(each, columns, strict=True))
+
+    return SimpleNamespace(log_prob=log_prob, entropy=lambda: sum(one.entropy() for one in each))
+
+
 @both_spaces
 @pytest.mark.parametrize(("scale", "entropy_weight"), [(0.5, 0.0), (0.5, 0.3), (2.0, 0.3)])
 def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
@@ -60,6 +88,8 @@ def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
     leaves = [torch.from_numpy(part).double().requires_grad_() for part in parts]
     if policy.discrete:
         expected = torch.distributions.Categorical(logits=leaves[0])
+    elif len(policy.parts):
+        expected = apart(leaves[0], policy.parts.tolist(), space)
     else:
         normal = torch.distributions.Normal(leaves[0], leaves[1].exp())
         expected = torch.distributions.Independent(normal, 1)
@@ -70,7 +100,7 @@ def test_log_probs_and_gradient_equal_autograd(space, scale, entropy_weight):
     np.testing.assert_allclose(found, log_probs.detach(), rtol=1e-4, atol=1e-4)
     grad_log_std = np.ones_like(policy.log_std)  # to which it is added
     given = outputs, policy.log_std, actions, weights.astype(np.float32), entropy_weight
-    grad, found = log_prob_gradient(*given, grad_log_std)
+    grad, found = log_prob_gradient(*given, grad_log_std, policy.parts)
     np.testing.assert_allclose(found, entropies.detach(), rtol=1e-4)
     np.testing.assert_allclose(grad[:, : outputs.shape[1]], gradients[0], rtol=1e-3, atol=1e-4)
     assert grad.shape == (50, 16) and not grad[:, outputs.shape[1] :].any()
@@ -132,9 +162,51 @@ def test_acting_has_the_bits_of_the_batch(space, hidden):
     policy = random_policy(space, hidden=hidden, scale=0.4)
     observations, _ = steps(policy, 100)
     rng = np.random.default_rng(8)
-    noise = rng.random(100) if policy.discrete else rng.standard_normal((100, 3))
+    noise = Actions("a test's", SPACES[space]).noise(100, rng)
     drawn = [acting(policy, *PLAIN).act(*pair) for pair in zip(observations, noise, strict=True)]
     actions, log_probs = (np.array(parts) for parts in zip(*drawn, strict=True))
     found = policy.log_probs(policy.network.outputs(observations), actions)
     assert found.dtype == np.float32 and (found == log_probs).all()
     assert len(np.unique(found)) > 90
+
+
+def test_each_part_is_drawn_by_its_own_number():
+    policy, observation = random_policy("MultiDiscrete"), np.zeros(SIZE, np.float32)
+    policy.parameters[:] = 0
+    biases = policy.parameters[-16:][:9]
+    biases[:] = np.log([0.1, 0.2, 0.7, 0.5, 0.5, 0.1, 0.2, 0.3, 0.4])
+    for uniforms, expected in (
+        ((0.05, 0.6, 0.95), [0, 1, 3]),
+        ((0.29, 0.4, 0.05), [1, 0, 0]),
+        ((0.31, 0.51, 0.59), [2, 1, 2]),
+    ):
+        action, log_prob = acting(policy, *PLAIN).act(observation, np.array(uniforms))
+        assert action.tolist() == expected and action.dtype == np.int64
+        chances = [0.1, 0.2, 0.7][expected[0]] * 0.5 * [0.1, 0.2, 0.3, 0.4][expected[2]]
+        assert log_prob == pytest.approx(np.log(chances), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Discrete(4, start=-1),
+        MultiDiscrete([3, 2]),
+        MultiDiscrete([[3, 2], [2, 5]], start=[[1, 0], [0, -2]]),
+        MultiBinary(3),
+        MultiBinary((2, 2)),
+        Box(-1, 1, (3,), np.float32),
+        Box(-2, 2, (2, 2), np.float64),
+        Box(-1, 1, (), np.float32),
+    ],
+    ids=str,
+)
+def test_environments_get_elements_of_their_space(space):
+    actions, rng = Actions("a test's", space), np.random.default_rng(0)
+    space.seed(0)
+    for _ in range(20):
+        wanted = space.sample()
+        chosen = actions.chosen(wanted)
+        given = actions.given(chosen, clips=True)
+        assert space.contains(given) and np.allclose(given, wanted)
+        assert np.array_equal(actions.chosen(given), chosen)
+    assert actions.noise(7, rng).shape[0] == 7

@@ -13,8 +13,9 @@ from typing import Any
 
 from mace_rl.base import files, stdio
 from mace_rl.base.errors import Refusal
+from mace_rl.config.plugins import call_of
 from mace_rl.config.run import RunConfig
-from mace_rl.config.section import ConfigError
+from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.library import settings
 from mace_rl.runs.finished import FinishedRun, finished
 
@@ -51,7 +52,8 @@ def parser() -> argparse.ArgumentParser:
     does = "carry out one training run; the same command resumes it if interrupted"
     run = "--env CartPole-v1 --variant mace_full --seed 0 --episodes 100 --out cartpole_run"
     add = command("train", train, does, run)
-    add("--env", required=True, help="a Gymnasium id: [module:][Namespace/]Id")
+    which = "a Gymnasium id, [module:][Namespace/]Id, or 'Id(key=literal, ...)' with arguments"
+    add("--env", required=True, help=which)
     add("--variant", required=True, help="one of the config's variant_settings")
     add("--seed", default=0, type=int, help="(default: 0)")
     add("--episodes", type=int, help="instead of the config's budget")
@@ -59,7 +61,8 @@ def parser() -> argparse.ArgumentParser:
     several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
     over = "YAML files read over the default settings, one after the other"
     add("--config", type=path, **several, help=over)
-    around = "a wrapper around the environment, module:Class; several: the innermost first"
+    around = "a wrapper around the environment, module:Class or 'module:Class(key=literal, ...)'"
+    around += "; several: the innermost first"
     add("--wrapper", action="append", metavar="NAME", help=around)
     slower = "of policy and critics: compiled (default) or plain PyTorch, slower, to check it by"
     add("--engine", choices=["compiled", "torch"], help=slower)
@@ -127,7 +130,12 @@ def run_config(arguments: argparse.Namespace) -> RunConfig:
     changes["environment_wrappers"] = arguments.wrapper
     changes = {key: value for key, value in changes.items() if value is not None}
     changes |= {"seed": arguments.seed, "config": arguments.config}
-    return settings(arguments.env, arguments.variant, **changes)
+    try:
+        name, own = call_of(arguments.env)
+    except ValueError as error:
+        raise ConfigError(f"--env is {short_repr(arguments.env)}, but {error}") from None
+    changes |= {"environment_arguments": own} if own else {}
+    return settings(name, arguments.variant, **changes)
 
 
 def train(arguments: argparse.Namespace) -> None:

@@ -199,7 +199,7 @@ class Meta(Stateful):
     STATE = ("printed", "draws")
 
     def __init__(self, spaces: Spaces, dropout: bool, draws: np.random.Generator) -> None:
-        self.printed, self.draws, self.actions = 0.0, draws, spaces.action_size
+        self.printed, self.draws, self.actions = 0.0, draws, spaces.actions.width
         with drawing_from(draws):
             self.network = MetaNetwork(spaces.observation_size + self.actions + 2, dropout)
 
@@ -221,7 +221,7 @@ def networks(config: AgentConfig, spaces: Spaces, streams: Streams) -> ActorCrit
         actor = Actor(size, spaces.action_size, settings.hidden_units, dropout)
     with drawing_from(streams["extrinsic_critic"]):
         critics = {"extrinsic": TorchNetwork(Critic(size, settings.hidden_units, dropout))}
-    policy = Policy(TorchNetwork(actor), spaces.action_space, settings.initial_log_std)
+    policy = Policy(TorchNetwork(actor), spaces.actions, settings.initial_log_std)
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), TorchLearner)
 
 

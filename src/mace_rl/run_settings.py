@@ -217,7 +217,7 @@ def _registered(config: RunConfig) -> EnvSpec:
 
 
 def _with_time_limit(config: RunConfig, spec: EnvSpec) -> RunConfig:
-    """Also where only the environment itself has one, `max_steps`, as MiniGrid's do."""
+    """Also where only the environment itself has one, `max_steps`, as MiniGrid's do; or none."""
     if config.max_episode_steps or spec.max_episode_steps:
         return config
     from mace_rl.environments.environment import trying_out  # numba takes a second
@@ -228,9 +228,5 @@ def _with_time_limit(config: RunConfig, spec: EnvSpec) -> RunConfig:
         limit = getattr(env.unwrapped, "max_steps", None)
         env.close()
     if not isinstance(limit, Integral) or isinstance(limit, bool):
-        raise ConfigError(
-            f"environment has {name!r}, which has no time limit of its own, so that its episodes "
-            f"need not end: --max-episode-steps or environment_settings.{name}.max_episode_steps "
-            "should set one"
-        )
+        return config
     return config.model_copy(update={"max_episode_steps": int(limit)})

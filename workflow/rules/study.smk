@@ -130,7 +130,7 @@ def most_work(wildcards):
     """A measure of how long a run can take: long ones start first, and no core idles at the end."""
     config = run_config(wildcards)
     own_limit = registered()[config.environment.rpartition(":")[2]].max_episode_steps
-    steps = config.episodes * (config.max_episode_steps or own_limit)
+    steps = config.episodes * (config.max_episode_steps or own_limit or 1000)
     return steps if config.beta.kind == "none" else 2 * steps
 
 

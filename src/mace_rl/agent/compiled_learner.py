@@ -47,7 +47,8 @@ class CompiledLearner(Stateful):
 
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
-        return CompiledActing.of(cast(CompiledMLP, policy.network), policy.log_std, normalisation)
+        network = cast(CompiledMLP, policy.network)
+        return CompiledActing.of(network, policy.log_std, policy.parts, normalisation)
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches
@@ -62,6 +63,7 @@ class CompiledLearner(Stateful):
             self.config.entropy_coefficient,
             self.config.learn_log_std,
             adam["actor"],
+            self.policy.parts,
         )
         norms = {"actor": norm}
         for kind, critic in self.critics.items():
@@ -75,7 +77,8 @@ class CompiledLearner(Stateful):
     ) -> list[np.ndarray]:
         observations = np.ascontiguousarray(observations, np.float32)
         network, parameters, several = self.network, self.policy.parameters, np.stack(advantages)
-        found = policy_gradients(observations, actions, several, parameters, network.sizes)
+        parts = self.policy.parts
+        found = policy_gradients(observations, actions, several, parameters, network.sizes, parts)
         if not self.config.learn_log_std:
             found[:, len(parameters) - len(self.policy.log_std) :] = 0
         return list(found)
@@ -85,10 +88,11 @@ class CompiledLearner(Stateful):
 
 
 @kernel
-def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_log_std, adam):
+def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_log_std, adam, parts):
     """Descend the clipped surrogate and entropy bonus (Schulman et al. 2017, eq. 7).
 
-    steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s.
+    steps: a `Batch`; sizes: the network's; adam: an `AdamState`, whose parameters are a `Policy`'s;
+    parts: its.
 
     Returns the fields of an `Update`, with this network's gradient norm alone.
     """
@@ -109,10 +113,10 @@ def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_lo
                 observations = gather(steps.observations, chosen)
                 actions = gather(steps.actions, chosen)
                 outputs = forward(observations, parameters, sizes, activations)[:, : sizes[-1]]
-                new[:] = log_probs(outputs, log_std, actions)
+                new[:] = log_probs(outputs, log_std, actions, parts)
                 weights = surrogate_weights(new, steps, chosen, clip, share)
                 grad, entropies[start:stop] = log_prob_gradient(
-                    outputs, log_std, actions, weights, share * entropy_coefficient, own
+                    outputs, log_std, actions, weights, share * entropy_coefficient, own, parts
                 )
                 backward(observations, activations, grad, back, sizes, gradient, scratch)
             if not learn_log_std:
@@ -148,7 +152,7 @@ def update_critic(observations, returns, minibatches, sizes, adam):
 
 
 @kernel
-def policy_gradients(observations, actions, advantages, parameters, sizes):
+def policy_gradients(observations, actions, advantages, parameters, sizes, parts):
     """∇_θ of the mean of log π(a|s) · A for each row of advantages, [K, N]; float32 [K, n]."""
     weights = (advantages / len(observations)).astype(np.float32)
     log_std, back = log_std_part(parameters, sizes), transposed(parameters, sizes)
@@ -160,7 +164,9 @@ def policy_gradients(observations, actions, advantages, parameters, sizes):
         outputs = forward(states, parameters, sizes, activations)[:, : sizes[-1]]
         for k in range(len(weights)):
             own = log_std_part(gradients[k], sizes)
-            grad, _ = log_prob_gradient(outputs, log_std, chosen, weights[k, start:end], 0.0, own)
+            grad, _ = log_prob_gradient(
+                outputs, log_std, chosen, weights[k, start:end], 0.0, own, parts
+            )
             backward(states, activations, grad, back, sizes, gradients[k], scratch)
     return gradients
 

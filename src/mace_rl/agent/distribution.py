@@ -1,7 +1,9 @@
 """Distributions over actions: softmax for Discrete ones, else a diagonal Gaussian; compiled.
 
 The Gaussian's log standard deviations, `log_std`, float32 [actions], do not depend on the state.
-For Discrete actions `log_std` is empty.
+For other actions `log_std` is empty. Actions of several parts (MultiDiscrete, MultiBinary) have an
+independent softmax each: `parts`, int64 [parts], has the number of choices in each, whose logits
+follow one another; it is empty for Discrete and Box actions.
 """
 
 import numpy as np
@@ -24,15 +26,24 @@ def log_sum_exp(logits):
 
 
 @kernel
-def log_probs(outputs, log_std, actions):
+def log_probs(outputs, log_std, actions, parts):
     """log π(a|s), float32 [N].
 
-    outputs: logits or means, [N, actions]; actions: int64 [N] or float32 [N, actions].
+    outputs: logits or means, [N, outputs]; actions: int64 [N], int64 [N, parts] or float32
+    [N, actions].
     """
     result = np.empty(len(outputs), np.float32)
     if actions.ndim == 1:
         for n in range(len(actions)):
             result[n] = outputs[n, actions[n]] - log_sum_exp(outputs[n])
+    elif len(parts):
+        result[:] = 0
+        first = 0
+        for j in range(len(parts)):
+            for n in range(len(actions)):
+                logits = outputs[n, first : first + parts[j]]
+                result[n] += logits[int(actions[n, j])] - log_sum_exp(logits)
+            first += parts[j]
     else:
         for n in range(len(actions)):
             total = f32(0)
@@ -44,11 +55,11 @@ def log_probs(outputs, log_std, actions):
 
 
 @kernel
-def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_log_std):
+def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_log_std, parts):
     """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at outputs and log_std.
 
-    weights: float32 [N]; outputs, log_std, actions: as in `log_probs`. Adds to grad_log_std, like
-    log_std. Returns the gradient at the outputs, [N, padded actions], and the entropies H, [N].
+    weights: float32 [N]; outputs, log_std, actions, parts: as in `log_probs`. Adds to grad_log_std,
+    like log_std. Returns the gradient at the outputs, [N, padded actions], and the entropies H, [N].
     """
     entropy_weight = f32(entropy_weight)
     grad = np.zeros((len(outputs), padded(outputs.shape[1])), np.float32)
@@ -66,6 +77,23 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
                 log_prob = logits[j] - log_total
                 grad[n, j] *= -(weights[n] + entropy_weight * (log_prob + entropy))
             grad[n, actions[n]] += weights[n]
+    elif len(parts):
+        entropies[:] = 0
+        first = 0
+        for j in range(len(parts)):
+            end = first + parts[j]
+            for n in range(len(actions)):
+                logits, own = outputs[n, first:end], grad[n, first:end]
+                log_total, entropy = log_sum_exp(logits), f32(0)
+                for i in range(len(logits)):
+                    own[i] = exp(logits[i] - log_total)
+                    entropy -= own[i] * (logits[i] - log_total)
+                entropies[n] += entropy
+                for i in range(len(logits)):
+                    log_prob = logits[i] - log_total
+                    own[i] *= -(weights[n] + entropy_weight * (log_prob + entropy))
+                own[int(actions[n, j])] += weights[n]
+            first = end
     else:
         entropies[:] = 0
         for j in range(len(log_std)):
@@ -98,4 +126,17 @@ def sample_gaussian(means, log_std, normal):
     action = np.empty(len(log_std), np.float32)
     for i in range(len(log_std)):
         action[i] = means[i] + exp(log_std[i]) * f32(normal[i])
-    return action, log_probs(means.reshape(1, -1), log_std, action.reshape(1, -1))[0]
+    parts = np.empty(0, np.int64)
+    return action, log_probs(means.reshape(1, -1), log_std, action.reshape(1, -1), parts)[0]
+
+
+@kernel
+def sample_parts(logits, parts, uniforms):
+    """An action of several parts, int64 [parts], and its log-probability; uniforms: [parts]."""
+    action, total, first = np.empty(len(parts), np.int64), f32(0), 0
+    for j in range(len(parts)):
+        end = first + parts[j]
+        action[j], log_prob = sample_categorical(logits[first:end], uniforms[j])
+        total += log_prob
+        first = end
+    return action, total

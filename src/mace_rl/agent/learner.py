@@ -16,7 +16,7 @@ class Batch(NamedTuple):
     """What the policy learns from: N steps of whole episodes, one after the other."""
 
     observations: np.ndarray  # float32 [N, observation], normalised
-    actions: np.ndarray  # int64 [N] or float32 [N, actions]
+    actions: np.ndarray  # as in an `Episode`
     log_probs: np.ndarray  # float32 [N], when the actions were taken
     advantages: np.ndarray  # float32 [N], of the total reward, normalised
 

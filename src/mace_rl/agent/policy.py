@@ -4,38 +4,42 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete
 
-from mace_rl.agent.distribution import log_probs, sample_categorical, sample_gaussian
+from mace_rl.agent.distribution import (
+    log_probs,
+    sample_categorical,
+    sample_gaussian,
+    sample_parts,
+)
+from mace_rl.environments.actions import Actions
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.network import CompiledMLP, Network
 from mace_rl.numerics.network_kernels import forward
 from mace_rl.numerics.normaliser import Normalisation, normalise
 
-Action = int | np.ndarray  # from 0, or float32 [actions] before clipping to the bounds
+# From 0; int64 [parts], from 0; or float32 [actions] before clipping to the bounds.
+Action = int | np.ndarray
 
 
 class Policy:
-    """Categorical for Discrete actions, diagonal Gaussian for Box ones.
+    """Categorical for Discrete actions, several for those of parts, diagonal Gaussian for Box ones.
 
     Samples are clipped to the action bounds only for the environment. `parameters`, float32 [n],
     are the network's, then the log standard deviations, which do not depend on the state.
     """
 
-    def __init__(
-        self, network: Network, action_space: Discrete | Box, initial_log_std: float
-    ) -> None:
+    def __init__(self, network: Network, actions: Actions, initial_log_std: float) -> None:
         self.network = network
-        self.discrete = isinstance(action_space, Discrete)
-        own = 0 if isinstance(action_space, Discrete) else action_space.shape[0]
+        self.discrete, self.parts = actions.discrete, actions.parts
+        own = actions.outputs if actions.continuous else 0
         count = len(network.parameters)
         self.parameters = np.full(count + own, initial_log_std, np.float32)
         network.move_to(self.parameters[:count])
-        self.log_std = self.parameters[count:]  # float32 [actions]; empty for Discrete actions
+        self.log_std = self.parameters[count:]  # float32 [actions]; empty unless they are Box ones
 
     def log_probs(self, outputs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """log π(a|s), float32 [N]; outputs: the network's, [N, out]; actions: as in `Batch`."""
-        return log_probs(outputs, self.log_std, actions)
+        return log_probs(outputs, self.log_std, actions, self.parts)
 
 
 class ActingPolicy(Protocol):
@@ -47,7 +51,8 @@ class ActingPolicy(Protocol):
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         """An action for one observation, float32 [observation], and its log-probability.
 
-        noise: uniform in [0, 1) for Discrete actions, else standard normal, [actions].
+        noise: uniform in [0, 1) for Discrete actions, [parts] for those of parts, else standard
+        normal, [actions].
         """
 
 
@@ -68,6 +73,8 @@ class NetworkActing:
         outputs = self.outputs(observation)[0]
         if self.policy.discrete:
             return sample_categorical(outputs, noise)
+        if len(self.policy.parts):
+            return sample_parts(outputs, self.policy.parts, noise)
         return sample_gaussian(outputs, self.policy.log_std, noise)
 
 
@@ -77,20 +84,25 @@ class CompiledActing(NamedTuple):
     normalisation: Normalisation
     parameters: np.ndarray  # float32, see `network_kernels`
     sizes: np.ndarray  # int64 [layers + 1]
-    log_std: np.ndarray  # float32 [actions]; empty for Discrete actions
+    log_std: np.ndarray  # float32 [actions]; empty unless they are Box ones
+    parts: np.ndarray  # int64 [parts]; empty unless they have several
     seen: np.ndarray  # scratch memory of `means_or_logits`, like the next
     activations: np.ndarray
 
     @classmethod
     def of(
-        cls, network: CompiledMLP, log_std: np.ndarray, normalisation: Normalisation
+        cls,
+        network: CompiledMLP,
+        log_std: np.ndarray,
+        parts: np.ndarray,
+        normalisation: Normalisation,
     ) -> "CompiledActing":
         """With this network."""
-        own = network.parameters, network.sizes, log_std
+        own = network.parameters, network.sizes, log_std, parts
         return cls(normalisation, *own, *network.scratch)
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
-        sample = act_box if len(self.log_std) else act_discrete
+        sample = act_box if len(self.log_std) else act_parts if len(self.parts) else act_discrete
         return sample(observation, self, noise)
 
 
@@ -106,6 +118,12 @@ def means_or_logits(observation, policy):
 def act_discrete(observation, policy, uniform):
     """`sample_categorical` from the network's logits for one observation."""
     return sample_categorical(means_or_logits(observation, policy), uniform)
+
+
+@kernel
+def act_parts(observation, policy, uniforms):
+    """`sample_parts` from the network's logits for one observation."""
+    return sample_parts(means_or_logits(observation, policy), policy.parts, uniforms)
 
 
 @kernel

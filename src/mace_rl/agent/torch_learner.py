@@ -27,7 +27,7 @@ class TorchLearner(Stateful):
         self.config = config
         self.parameters = parameters_of(policy, critics)
         self.actor = TorchPolicy(policy, validate=False)  # NaN is found in the gradients' norms
-        if not (self.actor.discrete or config.learn_log_std):
+        if self.actor.continuous and not config.learn_log_std:
             self.actor.log_std.register_hook(torch.zeros_like)
         self.policy_gradients = self.actor.gradients
         self.critics = {kind: critic.module() for kind, critic in critics.items()}

@@ -8,7 +8,6 @@ section), cut into stretches, so that a long episode is no longer to read than a
 import math
 
 import numpy as np
-from gymnasium.spaces import Discrete
 
 from mace_rl.base.state import Stateful
 from mace_rl.config.beta import MetaConfig
@@ -27,8 +26,8 @@ class SequenceReader(Stateful):
 
     def __init__(self, config: MetaConfig, spaces: Spaces) -> None:
         self.config = config
-        self.actions = spaces.action_size if isinstance(spaces.action_space, Discrete) else 0
-        self.inputs = spaces.observation_size + spaces.action_size + 2  # numbers in a row
+        self.actions = spaces.action_size if spaces.actions.discrete else 0
+        self.inputs = spaces.observation_size + spaces.actions.width + 2  # numbers in a row
         self.normaliser = RunningNormaliser(self.inputs)
 
     def read(self, episode: Episode, bonus: np.ndarray) -> np.ndarray:

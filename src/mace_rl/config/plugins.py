@@ -4,6 +4,7 @@ Modules are looked for where Python finds them, then in the current folder. A `r
 from somebody else: what it names from outside this package is imported only if it is trusted.
 """
 
+import ast
 import importlib
 import importlib.util
 import inspect
@@ -35,6 +36,23 @@ def code_outside(settings: Any) -> dict[str, str]:
         elif isinstance(value, str) and re.match(r"(?!mace_rl[.:]).*:", value, re.DOTALL):
             found[key] = value
     return found
+
+
+def call_of(text: str) -> tuple[str, dict[str, Any]]:
+    """Name and arguments in "name(key=literal, …)", or "name"; nothing in it is evaluated.
+
+    Raises `ValueError` for anything else.
+    """
+    name, bracket, rest = text.partition("(")
+    if not bracket:
+        return text, {}
+    try:
+        call: Any = ast.parse(f"f({rest}", mode="eval").body
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.args:
+            raise ValueError
+        return name, {str(one.arg): ast.literal_eval(one.value) for one in call.keywords if one.arg}
+    except (SyntaxError, ValueError):
+        raise ValueError("it should be a name, or name(key=literal, ...)") from None
 
 
 def load(reference: str, key: str) -> Any:

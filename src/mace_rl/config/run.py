@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PositiveInt, model_
 from mace_rl.config.agent import PPOConfig
 from mace_rl.config.beta import BetaConfig, MetaBeta, MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
+from mace_rl.config.plugins import call_of
 from mace_rl.config.published import COMPUTED, PublishedConfig
 from mace_rl.config.section import Arguments, Reference, Section, short_repr
 
@@ -41,6 +42,15 @@ def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
 EnvironmentArguments = Annotated[Arguments, AfterValidator(_of_the_constructor)]
 
 
+def as_shapes(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Lists of whole numbers as tuples: run.json has no tuples, and shapes are some."""
+
+    def is_shape(value: Any) -> bool:
+        return isinstance(value, list) and value != [] and all(type(one) is int for one in value)
+
+    return {key: tuple(value) if is_shape(value) else value for key, value in arguments.items()}
+
+
 class WrapperConfig(Section):
     """A Gymnasium wrapper, "module:Class", made as Class(env, **arguments)."""
 
@@ -49,7 +59,10 @@ class WrapperConfig(Section):
 
 
 def _by_name(given: Any) -> Any:
-    return {"wrapper": given} if isinstance(given, str) else given
+    if not isinstance(given, str):
+        return given
+    name, arguments = call_of(given)
+    return {"wrapper": name, "arguments": arguments}
 
 
 class AgentConfig(Section):
@@ -75,7 +88,7 @@ class AgentConfig(Section):
     @property
     def wrappers(self) -> list[tuple[str, dict[str, Any]]]:
         """Those around the environment, the innermost first, with their arguments."""
-        return [(one.wrapper, one.arguments) for one in self.environment_wrappers or ()]
+        return [(one.wrapper, as_shapes(one.arguments)) for one in self.environment_wrappers or ()]
 
 
 class RunConfig(AgentConfig):

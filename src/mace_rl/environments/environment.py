@@ -25,6 +25,7 @@ LOST = "lost"  # a key of `Environment.memory`
 FASTER = {"HopperBulletEnv-v0": "mace_rl.environments.hopper:FastHopperBulletEnv"}
 # Where what a step returned is taken apart.
 UNPACKS = (__name__, "gymnasium.core", "gymnasium.wrappers")
+UNLIMITED = 10**5  # steps of an episode that has no time limit, and should end by itself
 MOST_STEPS = 10**6  # of an episode; its noise is drawn before it ...
 MOST_NOISE = 10**8  # ... with so many numbers at most
 
@@ -90,13 +91,13 @@ class Environment(Spaces):
         except gymnasium.error.Error as error:
             raise ConfigError(f"environment {name!r}: {error}") from None
         spec.entry_point = FASTER.get(name, spec.entry_point)
-        self.max_steps: int = max_episode_steps or spec.max_episode_steps or 0
-        spec.max_episode_steps = self.max_steps
+        spec.max_episode_steps = max_episode_steps or spec.max_episode_steps
+        self.ends_by_itself = spec.max_episode_steps is None
+        self.max_steps: int = spec.max_episode_steps or UNLIMITED
         if not 1 <= self.max_steps <= MOST_STEPS:
-            found = f"a time limit of {self.max_steps}" if self.max_steps else "no time limit"
             raise ConfigError(
-                f"environment {name!r} has {found} (max_episode_steps), but whole episodes are "
-                f"kept; set one of 1 to {MOST_STEPS} steps"
+                f"environment {name!r} has a time limit of {self.max_steps} (max_episode_steps), "
+                f"but whole episodes are kept; set one of 1 to {MOST_STEPS} steps"
             )
         self.wrapped = bool(wrappers)  # by more than Gymnasium's own
         with trying_out(f"environment {name!r}{f' with {arguments}' if arguments else ''}"):
@@ -111,7 +112,7 @@ class Environment(Spaces):
                 f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "
                 "policy gives fractions; make them Discrete, or a Box of floats"
             )
-        if isinstance(self.action_space, Box) and self.max_steps * self.action_size > MOST_NOISE:
+        if self.actions.continuous and self.max_steps * self.action_size > MOST_NOISE:
             raise ConfigError(
                 f"environment {name!r} has {self.action_size} numbers in an action, and its "
                 f"time limit is {self.max_steps}, not up to {MOST_NOISE // self.action_size}"
@@ -144,13 +145,6 @@ class Environment(Spaces):
         except Exception as error:
             error.add_note(f"in a reset of {self.name}")
             raise
-
-    def within(self, action: np.ndarray) -> np.ndarray:
-        """A new array, [actions]: the action as the environment gets it, of its space."""
-        space: Any = self.action_space
-        given = action.clip(space.low, space.high) if self.clips_actions else action.copy()
-        same = given.dtype == space.dtype or np.can_cast(given.dtype, space.dtype)
-        return given if same else given.astype(space.dtype)
 
     def step(self, action: Any, number: int) -> tuple[Any, float, bool, bool]:
         """Observation, reward and flags, checked; `action` is the `number`th of an episode."""

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 from mace_rl.config.section import ConfigError, short_repr
+from mace_rl.environments.actions import Actions
 from mace_rl.numerics.finite import TOO_LARGE, all_below, require_finite
 
 MOST_NUMBERS = 10**4  # in an observation or an action: each is a row of networks and memory
@@ -40,20 +41,16 @@ class Spaces:
         self.composite = observations if isinstance(observations, COMPOSITE) else None
         if not isinstance(observations, Box | Discrete):
             observations = gymnasium.spaces.flatten_space(observations)
-        box = isinstance(actions, Box) and len(actions.shape) == 1
-        if not (box or isinstance(actions, Discrete)):
-            raise ConfigError(
-                f"environment {name!r} has actions {actions}; Discrete and one-dimensional Box "
-                "work, of which a gymnasium.ActionWrapper of yours makes others"
-            )
+        self.actions = Actions(name, actions)
         require_size(name, actions)
-        assert isinstance(observations, Box | Discrete) and isinstance(actions, Box | Discrete)
+        assert isinstance(observations, Box | Discrete)
         self.name = name
-        self.observation_space, self.action_space = observations, actions
+        self.observation_space: Box | Discrete = observations
+        self.action_space: Any = actions
         self.discrete_observations = isinstance(observations, Discrete)
         self.whole = is_discrete(self.given_space)
         self.observation_size = int(gymnasium.spaces.flatdim(observations))
-        self.action_size = int(actions.n) if isinstance(actions, Discrete) else actions.shape[0]
+        self.action_size = self.actions.outputs
 
     def encode(self, observation: Any, step: int | None = None) -> np.ndarray:
         """`observation` as a float32 vector, [observation_size]; may share its memory.
@@ -115,11 +112,14 @@ def require_flat(name: str, space: gymnasium.Space[Any], entry: str = "") -> Non
             require_flat(name, part, f"{entry}[{key!r}]")
     elif not isinstance(space, FLAT):
         what = f"the observation{entry} is of {type(space).__name__}"
-        leaves_out = "leaves it out (gymnasium.wrappers:FilterObservation) or " if entry else ""
+        leaves_out = (
+            "leaves it out ('gymnasium.wrappers:FilterObservation(filter_keys=[...])') or "
+            if entry
+            else ""
+        )
         raise ConfigError(
             f"environment {name!r}: {what}, and not so many numbers at every step; it needs a "
-            f"wrapper that {leaves_out}makes numbers of it, which environment_wrappers names with "
-            "its arguments, --wrapper without"
+            f"wrapper that {leaves_out}makes numbers of it, by --wrapper or environment_wrappers"
         )
 
 
@@ -153,9 +153,13 @@ def require_size(name: str, space: gymnasium.Space[Any]) -> None:
     """Raise `ConfigError` for vectors with no or too many numbers."""
     size = int(gymnasium.spaces.flatdim(space))
     if not 1 <= size <= MOST_NUMBERS:
+        image = isinstance(space, Box) and len(space.shape) in (2, 3) and size
+        smaller = "gymnasium.wrappers:ResizeObservation(shape=(64, 64))"
         raise ConfigError(
             f"environment {name!r} has {size} numbers in {short_repr(space)}; 1 to"
             f" {MOST_NUMBERS} work"
+            + f": an image gets smaller by --wrapper '{smaller}' and --wrapper "
+            "gymnasium.wrappers:GrayscaleObservation" * bool(image)
         )
 
 

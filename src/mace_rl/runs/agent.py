@@ -96,7 +96,12 @@ class MostProbable(NetworkActing):
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         outputs = self.outputs(observation)
-        action = int(outputs[0].argmax()) if self.policy.discrete else outputs[0]
+        action: Action = outputs[0]
+        if self.policy.discrete:
+            action = int(outputs[0].argmax())
+        elif len(self.policy.parts):
+            each = np.split(outputs[0], self.policy.parts.cumsum()[:-1])
+            action = np.array([part.argmax() for part in each])
         return action, self.policy.log_probs(outputs, np.array([action]))[0]
 
 
@@ -154,7 +159,7 @@ class Player:
         self.agent.load_state_dict(state)
         policy, loaded = self.networks.policy, self.agent.policy
         policy.network.load_module_state(loaded.network.state_dict())
-        if not policy.discrete:
+        if len(policy.log_std):
             policy.log_std[:] = loaded.log_std.detach().numpy()
 
     def acting(self, deterministic: bool) -> ActingPolicy:

@@ -153,7 +153,7 @@ def actor_critic(
         network, learner = TorchNetwork, TorchLearner
     # With a small last layer the policy starts near uniform, or with means near 0.
     actor = network(module(spaces.action_size, 0.01, "actor"))
-    policy = Policy(actor, spaces.action_space, settings.initial_log_std)
+    policy = Policy(actor, spaces.actions, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
     critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)

@@ -6,7 +6,6 @@ CartPole-v1 and Acrobot-v1 run in one compiled loop, which gives the same episod
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.envs.classic_control import AcrobotEnv, CartPoleEnv
 
@@ -22,21 +21,15 @@ COMPILED = {"CartPole-v1": CartPoleEnv, "Acrobot-v1": AcrobotEnv}  # what the co
 
 
 def draw_noise(environment: Environment, generator: np.random.Generator) -> np.ndarray:
-    """The random numbers that turn policy outputs into actions, up to the time limit.
-
-    Uniform, [max_steps], for Discrete actions; else standard normal, [max_steps, actions].
-    """
-    if isinstance(environment.action_space, gymnasium.spaces.Discrete):
-        return generator.random(environment.max_steps)
-    return generator.standard_normal((environment.max_steps, environment.action_space.shape[0]))
+    """The random numbers that turn policy outputs into actions, up to the time limit."""
+    return environment.actions.noise(environment.max_steps, generator)
 
 
 def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) -> Episode:
     """Play one episode by stepping the environment; see `Episode`."""
-    space: Any = environment.action_space  # Discrete or Box
-    discrete = isinstance(space, gymnasium.spaces.Discrete)
+    kind, clips = environment.actions, environment.clips_actions
     observations = np.empty((len(noise) + 1, environment.observation_size), np.float32)
-    actions = np.empty(noise.shape, np.int64 if discrete else np.float32)
+    actions = np.empty(noise.shape, np.float32 if kind.continuous else np.int64)
     log_probs = np.empty(len(noise), np.float32)
     rewards = np.empty(len(noise))
     observations[0] = environment.encode(environment.reset(), 0)
@@ -44,20 +37,28 @@ def roll_out(environment: Environment, policy: ActingPolicy, noise: np.ndarray) 
     t = 0
     while not (terminated or truncated):
         if t == len(noise):
-            raise ConfigError(
-                f"environment {environment.name!r} goes on after {t} steps, its time limit: "
-                "a wrapper hides `truncated`"
-            )
+            raise ConfigError(f"environment {environment.name!r} {endless(environment)}")
         action: Any
         action, log_prob = policy.act(observations[t], noise[t])
         actions[t], log_probs[t] = action, log_prob
-        env_action = action + int(space.start) if discrete else environment.within(action)
-        observation, rewards[t], terminated, truncated = environment.step(env_action, t + 1)
+        given = kind.given(action, clips)
+        observation, rewards[t], terminated, truncated = environment.step(given, t + 1)
         t += 1
         observations[t] = environment.encode(observation, t)
     # Copies: an episode that ended early should not hold the memory of a whole one.
     states, actions, log_probs = observations[: t + 1].copy(), actions[:t].copy(), log_probs[:t]
     return Episode(states, actions, log_probs.copy(), rewards[:t].copy(), terminated)
+
+
+def endless(environment: Environment) -> str:
+    """What is wrong with an episode that does not end."""
+    steps, setting = environment.max_steps, "environment_settings.ENV.max_episode_steps"
+    if environment.ends_by_itself:
+        return (
+            f"has no time limit, and an episode of it goes on after {steps} steps: "
+            f"--max-episode-steps or {setting} should set one"
+        )
+    return f"goes on after {steps} steps, its time limit: a wrapper hides `truncated`"
 
 
 def roll_out_compiled(

@@ -10,7 +10,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Discrete
 
 from mace_rl.agent.advantages import discounted_returns
 from mace_rl.agent.scale import RewardScale, discounted_sums
@@ -156,11 +155,8 @@ class CuriosityTracker(Stateful):
         return len(recording.rewards) if recording else 0
 
     def as_recorded(self, action: Any) -> Any:
-        """An action as an `Episode` has it: an int from 0, or a copy, float32 [actions]."""
-        space = self.spaces.action_space
-        if isinstance(space, Discrete):
-            return int(action) - int(space.start)
-        return np.array(action, np.float32)
+        """An action as an `Episode` has it; a copy."""
+        return self.spaces.actions.chosen(action)
 
     def reward_parts(
         self, environment: int, action: Any, reward: Any, observation: Any

@@ -94,8 +94,8 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Adds β · R_curiosity to the reward of an environment; see the module for what that means.
 
     env: observations are of any space that has a flat form, and the agent gets them unchanged;
-        actions are Discrete or one-dimensional Box. Episodes have to end, by a time limit or a
-        reset: nothing is learned from one that does not.
+        actions are Discrete, MultiDiscrete, MultiBinary or Box. Episodes have to end, by a time
+        limit or a reset: nothing is learned from one that does not.
     beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
         "exponential", …} or "custom". Not "meta", "pretrained" or "hybrid": policy gradients.
     centred: False to pay R_curiosity itself, not what it is beyond its present mean.
