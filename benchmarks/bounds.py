@@ -68,7 +68,7 @@ class Work:
         counted(
             compiled_learner,
             "update_policy",
-            lambda _, batch, order, sizes, *rest: self.update(order, sizes, rest[-1]),
+            lambda _, batch, order, sizes, *rest: self.update(order, sizes, rest[-2]),
         )
         counted(
             compiled_learner,

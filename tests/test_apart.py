@@ -56,7 +56,11 @@ def seeds_of(study: dict, env: str) -> list[int]:
 
 def asked(study: dict) -> list[dict]:
     """The parts of all families for which a study has the runs, each by its `NAMES`."""
-    found = []
+    learned, found = study["metrics"].get("learned", "mace_full"), []
+
+    def as_learned(variant: str | None) -> str | None:
+        return learned if variant == "mace_full" else variant
+
     for family, content in CLAIMS["families"].items():
         parts = []
         for (claim, said), way in itertools.product(content["claims"].items(), CLAIMS["ways"]):
@@ -64,7 +68,7 @@ def asked(study: dict) -> list[dict]:
                 envs, own = part["environments"], [part["metric"], part["variant"]]
                 each = [envs] if part.get("together") else [[env] for env in envs]
                 for where, over in itertools.product(each, part["over"] or [None]):
-                    names = [family, claim, way, where, *own, over]
+                    names = [family, claim, way, where, own[0], *map(as_learned, (own[1], over))]
                     parts.append(dict(zip(NAMES, names, strict=True)))
         variants = {part[key] for part in parts for key in ("variant", "baseline")} - {None}
         where = {env for part in parts for env in part["environments"]}
@@ -124,7 +128,11 @@ def estimated(part: dict, runs: pd.DataFrame, study: dict, draws: np.random.Gene
     beyond = [sign_flip([sign * own - margin for own in differences], draws) for sign in (1, -1)]
     if of_episodes and not together:
         column, printed = int(metric.startswith("convergence")), PAPER[part["environments"][0]]
-        paper = printed[part["baseline"]][column] - printed[part["variant"]][column]
+        mine, theirs = (
+            printed[name if name in printed else "mace_full"][column]  # the learned β's
+            for name in (part["variant"], part["baseline"])
+        )
+        paper = theirs - mine
     reach = stats.t.ppf(0.975, n - 1) * np.std(differences[0], ddof=1) * np.sqrt(1 + 1 / n)
     mean = np.mean([own.mean() for own in differences])
     found = {"seeds": n, "difference": mean, "low": low, "high": high}
@@ -230,6 +238,8 @@ def by_public_code(episodes: bytes, random_return: float, own: dict) -> list[int
 
 def measured(name: str, study: dict, env: str, variant: str) -> np.ndarray:
     """`by_public_code` of all runs of a variant; metrics.csv has the same."""
+    if variant == "mace_full":
+        variant = study["metrics"].get("learned", variant)
     runs = kept_runs.read(ROOT / STUDIES[name]["runs"] / env / f"{variant}.tar.xz")
     given = study["metrics"]["random_return"][env], study["metrics"]
     episodes = [runs[f"seed{seed}/episodes.csv"] for seed in seeds_of(study, env)]

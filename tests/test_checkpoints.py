@@ -181,7 +181,7 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
 
 def test_a_state_that_would_not_be_read_again_is_named(run_config, register, tmp_path):
     name = register("Draws-v0", Draws, 5, kind="offered badly")
-    message = r"state.environment.own.resets is np.int64\(1\), but should be a tensor"
+    message = r"state.environment.remembered.own.resets is np.int64\(1\), but should be a tensor"
     with pytest.raises(checkpoint.CheckpointError, match=message):
         run.run(run_config(name, "ppo", 0, episodes=2), tmp_path)
 

@@ -15,7 +15,6 @@ CHANGES = [  # of a file, what is added, whether a training has other sources, a
     ("mace_study/measure/metrics.py", "ADDED = 1", False, True, False),
     ("mace_study/show/sections.py", 'CAPTION = "another"', False, True, False),
     ("mace_rl/a_new_file.py", "ADDED = 1", True, True, False),
-    ("mace_rl/beta/weights.npz", "x", True, True, False),
     ("mace_rl/base/stdio.py", "", False, False, False),  # a blank line
     ("mace_rl/agent/ppo.py", "# a comment", False, False, True),
     ("mace_rl/agent/ppo.py", '"""Not the docstring."""', True, True, True),  # a statement

@@ -97,10 +97,9 @@ MISTAKES = {
     "bonus.arguments.d is {1}": {"bonus": OWN | {"estimator": "a:B"}},
     "novelty.arguments.d is {1}": {"novelty": OWN | {"estimator": "a:B"}},
     "ppo.network.arguments.d is {1}": {"ppo": {"network": OWN | MODULE}},
-    "--max-episode-steps": {"environment": "Blackjack-v1"},
     "nearest there is 'CartPole-v1'": {"environment": "CartPole-v9"},
     "in the changes: unknown key 'memory.capacty'": {"variant": "ppo", "memory": {"capacty": 3}},
-    "in the changes: meta.horizon is 0, but": {"variant": "mace_fixed", "meta": {"horizon": 0}},
+    "in the changes: meta.chunks is 0, but": {"variant": "mace_fixed", "meta": {"chunks": 0}},
     "in the changes: novelty is 5, but": {"variant": "ppo", "novelty": 5},
     "'max_episode_steps' is not for the environment's constructor": {
         "environment_arguments": {"max_episode_steps": 5}

@@ -21,6 +21,7 @@ PROTOCOLS = {
     "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
     "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
+    "8a48ade": ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
 }
 WORLDS = {  # what is read over config.yaml
     "tuned": ["worlds/tuned"],
@@ -33,6 +34,7 @@ WORLDS = {  # what is read over config.yaml
     "decided": ["plain", "worlds/decided"],
     "initial": ["plain", "worlds/initial"],
     "minigrid": ["questions", "controls", "minigrid", "worlds/minigrid"],
+    "readings": ["plain", "worlds/readings"],
 }
 TASKS = ("exploration", "controls", "planted", "distracting")  # whose runs lie together
 

@@ -81,8 +81,6 @@ metrics: {custom: [no_such:metric]}  # metrics.custom, 'no_such:metric'
 environments: [no_such:Walk-v0]  # environment, 'no_such:Walk-v0', no_such
 environments: [CartPole-v9]  # environment, 'CartPole-v9', 'CartPole-v1'
 environment_settings: {HoperBulletEnv-v0: {}}  # 'HoperBulletEnv-v0', 'HopperBulletEnv-v0'
-environments: [CliffWalking-v1]  # environment, settings.CliffWalking-v1.max_episode_steps should
-environment_settings: {Blackjack-v1: {}}  # time limit, settings.Blackjack-v1.max_episode_steps
 environment_settings: {CliffWalking-v1: {max_episode_steps: 0}}  # CliffWalking-v1, steps, 0
 environments: [LunarLander-v3]  # environment, 'LunarLander-v3', installed
 environments: [phys2d/CartPole-v1]  # environment, 'phys2d/CartPole-v1', installed
@@ -148,7 +146,7 @@ def test_mistake_is_named_in_one_line(line: str) -> None:
 
 LAYERS = """
 training: {episodes: 1, ppo: {clip: 0.1, epochs: 1}, beta: {kind: constant, value: 0.4}}
-environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {horizon: 2}}}
+environment_settings: {CartPole-v1: {episodes: 2, ppo: {clip: 0.2}, meta: {chunks: 2}}}
 variant_settings: {mace_full: {episodes: 3, ppo: {discount: 0.3}}}
 """
 
@@ -165,7 +163,7 @@ def test_settings_go_over_one_another_in_order() -> None:
     both = study.run_config("CartPole-v1", "mace_full", 0)
     assert (both.episodes, both.ppo.clip, both.ppo.discount) == (3, 0.2, 0.3)
     assert (both.environment, both.variant) == ("CartPole-v1", "mace_full")
-    assert both.meta.horizon == 2
+    assert both.meta.chunks == 2
 
 
 SECTIONS = {"memory", "novelty", "meta"}
@@ -177,7 +175,7 @@ SECTIONS = {"memory", "novelty", "meta"}
 )
 def test_a_run_holds_the_sections_that_its_variant_uses(variant: str, used: set[str]) -> None:
     """So that a change of the others leaves its settings, and with them its runs, alone."""
-    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"horizon": 7}}
+    over = {"memory": {"capacity": 77}, "novelty": {"knn_weight": 0.3}, "meta": {"chunks": 7}}
     studies = [load_study(changed({"training": one}), "test") for one in ({}, over)]
     plain, other = (study.run_config("CartPole-v1", variant, 0) for study in studies)
     assert SECTIONS & set(plain.settings()) == used

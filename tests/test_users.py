@@ -57,7 +57,7 @@ def test_actions_of_every_kind_are_learned(run_config, register, kind, engine):
 
 @pytest.mark.parametrize("kind", SPACES)
 def test_who_plays_with_such_an_agent_gets_such_actions(trained, register, kind):
-    name = register("Copies-v0", Copies, None, kind=kind)
+    name = register(f"Copies{kind}-v0", Copies, None, kind=kind)
     folder = trained(name, "mace_fixed", 0, episodes=3)
     assert len(evaluate(folder, 2, 0, trust=True)) == 2
     returns = evaluate(folder, 2, 0, deterministic=True, trust=True)
@@ -131,5 +131,5 @@ def test_arguments_on_the_command_line(monkeypatch, tmp_path):
 
 
 def test_a_large_image_is_told_how_to_get_smaller():
-    with refused(ConfigError, "100800 numbers .*ResizeObservation.shape=.64, 64.. .*Grayscale"):
+    with refused(ConfigError, "100800 numbers .*ResizeObservation.shape=.64, 64.*Grayscale"):
         Spaces("a test's", Box(0, 255, (210, 160, 3), np.uint8), Discrete(2))

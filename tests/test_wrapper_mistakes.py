@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete, MultiBinary, MultiDiscrete, Text
+from gymnasium.spaces import Discrete, MultiBinary, Text, Tuple
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
 from shared import BANDIT, play, refused, vector_of
@@ -72,7 +72,7 @@ def paying(reward) -> gymnasium.Env:
     return TransformReward(gymnasium.make("CartPole-v1"), lambda _: next(paid))
 
 
-TWO_ACTIONS = TransformAction(gymnasium.make("CartPole-v1"), None, MultiDiscrete([2, 2]))
+TWO_ACTIONS = TransformAction(gymnasium.make("CartPole-v1"), None, Tuple([Discrete(2)]))
 PAIR, NO_MODE = vector_of("CartPole-v1", 2, NEXT), vector_of("CartPole-v1", 1, NEXT)
 NO_MODE.metadata = {}
 
@@ -81,7 +81,7 @@ NO_MODE.metadata = {}
     ("form", "given", "error", "message"),
     [
         (CuriosityReward, [observing([], Text(3))], ConfigError, "the observation is of Text"),
-        (CuriosityReward, [TWO_ACTIONS], ConfigError, "has actions MultiD.*ActionWrapper"),
+        (CuriosityReward, [TWO_ACTIONS], ConfigError, "has actions Tuple.*ActionWrapper"),
         # stable-baselines3's are none of Gymnasium's.
         (CuriosityReward, [make_vec_env("CartPole-v1", 2)], TypeError, "Expected env to be"),
         (VectorCuriosityReward, [PAIR, BANDIT], ConfigError, "Bandit.*2 go on at once"),

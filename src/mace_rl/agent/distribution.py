@@ -59,7 +59,7 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
     """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at outputs and log_std.
 
     weights: float32 [N]; outputs, log_std, actions, parts: as in `log_probs`. Adds to grad_log_std,
-    like log_std. Returns the gradient at the outputs, [N, padded actions], and the entropies H, [N].
+    like log_std. Returns the gradient at the outputs, [N, padded], and the entropies H, [N].
     """
     entropy_weight = f32(entropy_weight)
     grad = np.zeros((len(outputs), padded(outputs.shape[1])), np.float32)

@@ -50,7 +50,9 @@ def call_of(text: str) -> tuple[str, dict[str, Any]]:
         call: Any = ast.parse(f"f({rest}", mode="eval").body
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.args:
             raise ValueError
-        return name, {str(one.arg): ast.literal_eval(one.value) for one in call.keywords if one.arg}
+        if not all(one.arg for one in call.keywords):
+            raise ValueError
+        return name, {str(one.arg): ast.literal_eval(one.value) for one in call.keywords}
     except (SyntaxError, ValueError):
         raise ValueError("it should be a name, or name(key=literal, ...)") from None
 
