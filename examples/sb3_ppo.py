@@ -21,10 +21,12 @@ from mace_study.compare.statistics import mean_interval, paired_comparison
 MEASURES = ("all episodes", "last tenth")
 
 
-def train(environment: str, curious: bool, seed: int, steps: int) -> np.ndarray:
+def train(
+    environment: str, curious: bool, seed: int, steps: int, centred: bool = True
+) -> np.ndarray:
     """The extrinsic returns of all episodes of a training, [episodes]."""
     monitor = Monitor(gymnasium.make(environment))  # inside, so that it sees extrinsic rewards
-    env = CuriosityReward(monitor, beta=0.4, seed=seed) if curious else monitor
+    env = CuriosityReward(monitor, 0.4, centred=centred, seed=seed) if curious else monitor
     agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=seed, device="cpu")
     agent.learn(steps)
     return np.array(monitor.get_episode_rewards())
@@ -41,6 +43,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=12_000, help="default: %(default)s")
     parser.add_argument("--seeds", type=int, default=10, help="how many, default: %(default)s")
     parser.add_argument("--first-seed", type=int, default=0, help="default: %(default)s")
+    pays = "pay all of R_curiosity, not what is beyond its present mean"
+    parser.add_argument("--uncentred", action="store_true", help=pays)
     arguments = parser.parse_args()
     for option, least in {"steps": 1, "seeds": 1, "first_seed": 0}.items():
         value = getattr(arguments, option)
@@ -60,7 +64,8 @@ def main() -> None:
     print("| --- |", " | ".join(["--:"] * len(heads)), "|", flush=True)
     for i, seed in enumerate(seeds):
         for curious in (False, True):
-            returns = train(arguments.environment, curious, seed, arguments.steps)
+            own = arguments.environment, curious, seed, arguments.steps
+            returns = train(*own, centred=not arguments.uncentred)
             if not len(returns):
                 sys.exit(f"sb3_ppo: no episode ended in --steps {arguments.steps}: give more")
             last = returns[-max(len(returns) // 10, 1) :]

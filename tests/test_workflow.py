@@ -175,7 +175,7 @@ CHANGES = [  # of a file, from one text to another, and what is to be done then
     (CONFIG, "threshold: 0.75", "threshold: 0.7", EVALUATION),
     (CONFIG, "clip: 0.2", "clip: 0.3", TRAIN | {"table2": 1}),
     (CONFIG, "capacity: 1000", "capacity: 999", TRAIN | {"train": 4}),  # what the bonus uses
-    (CONFIG, "{kind: meta, initial: 0.4}", "{kind: meta, initial: 0.5}", TRAIN | {"train": 2}),
+    (CONFIG, "window: 50, noise", "window: 40, noise", TRAIN | {"train": 2}),
     (
         *(CONFIG, "    clip: 0.2 # [P] Table 2, ε (clip_range)\n    gae_lambda: 0.99 # [C]"),
         *("    gae_lambda: 0.99\n    clip: 0.2 # [C]", {}),  # the order of keys, and a comment
