@@ -21,7 +21,6 @@ PROTOCOLS = {
     "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
     "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
-    "8a48ade": ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
 }
 WORLDS = {  # what is read over config.yaml
     "tuned": ["worlds/tuned"],

@@ -16,7 +16,7 @@ from mace_rl.base.stdio import keep_open
 from mace_rl.config.plugins import import_module, make
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.environments import registered
-from mace_rl.environments.remembered import fractions, hold_still, remembered, restore
+from mace_rl.environments.remembered import OWN, fractions, hold_still, remembered, restore
 from mace_rl.environments.spaces import Spaces
 
 LOST = "lost"  # a key of `Environment.memory`
@@ -131,7 +131,10 @@ class Environment(Spaces):
         """What it has learned, to play on with: `remembered`, and the name of what cannot be."""
         now = fractions(self.env)
         lost = [key.split()[1] for key in now if now[key] != self.fresh.get(key)]
-        return remembered(self.env) | ({LOST: lost[0]} if lost else {})
+        found = remembered(self.env)
+        if not self.wrapped and type(self.env.unwrapped).__module__.startswith("mace_rl."):
+            found.pop(OWN, None)  # ours learn nothing: it is which episode comes next
+        return found | ({LOST: lost[0]} if lost else {})
 
     def recall(self, memory: dict[str, Any]) -> None:
         """Play on with what `memory` returned of a training, and learn no more."""
