@@ -19,6 +19,7 @@ from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.training.factories import environment
+from mace_rl.training.rollout import endless
 from mace_study.config.study import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,17 +44,20 @@ def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
 
     `ConfigError` if the environment cannot be made with these arguments.
     """
-    env: gymnasium.Env[Any, Any] = environment(config, Streams(0)).env
+    made = environment(config, Streams(0))
+    env: gymnasium.Env[Any, Any] = made.env
     env.action_space.seed(0)
     env.reset(seed=0)
     returns = np.zeros(episodes)
     for episode in range(episodes):
         env.reset()
-        over = False
-        while not over:
+        for _ in range(made.max_steps):
             _, reward, terminated, truncated, _ = env.step(env.action_space.sample())
             returns[episode] += reward
-            over = terminated or truncated
+            if terminated or truncated:
+                break
+        else:
+            raise ConfigError(f"environment {made.name!r} {endless(made)}")
     return returns
 
 
