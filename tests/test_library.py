@@ -211,8 +211,11 @@ def test_train_is_the_command_and_calls_back_for_each_episode(monkeypatch, tmp_p
     observation = [0.1, 0.0, -0.1, 0.2]
     logits = [a.policy(observation).logits for a in (trained.agent, load_agent(tmp_path / "own"))]
     assert logits[0].tolist() == logits[1].tolist()
-    with pytest.raises(ConfigError, match="episodes was 8 and is 9"):
-        train(settings("CartPole-v1", "mace_full", seed=5, episodes=9), folder=tmp_path / "own")
+    with pytest.raises(ConfigError, match="episodes was 8 and is 7"):
+        train(settings("CartPole-v1", "mace_full", seed=5, episodes=7), folder=tmp_path / "own")
+    longer = settings("CartPole-v1", "mace_full", seed=5, episodes=9)
+    assert train(longer, told.append, tmp_path / "own").episodes == train(longer).episodes
+    assert told[-1].episode == 9
 
 
 def test_the_folder_of_an_id_with_a_namespace(register, monkeypatch, tmp_path):

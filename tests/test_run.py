@@ -25,16 +25,20 @@ from shared import (
     OUTCOME,
     RESULTS,
     ROOT,
+    RULE,
     UNFINISHED,
     Killed,
     content_of,
     files,
     finish,
+    pretrained,
     provenance_of,
+    refused,
 )
 
 from mace_rl.base import code_digest
 from mace_rl.base.files import LOCK
+from mace_rl.config.section import ConfigError
 from mace_rl.environments import hopper
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
@@ -348,3 +352,55 @@ def test_deleted_results_come_back_from_the_last_checkpoint(run_config, tmp_path
     assert [(tmp_path / name).read_bytes() for name in OUTCOME] == before
     (interruption,) = provenance_of(tmp_path)["interruptions"]
     assert interruption["after_episode"] == 4
+
+
+@pytest.mark.parametrize(("steps", "before"), [(1, 12), (200, 12), (200, 1)])
+def test_a_finished_run_goes_on_as_if_it_had_had_more_episodes(
+    run_config, tmp_path, monkeypatch, steps, before
+):
+    """Also if its last rollout was cut short; killed while it goes on, what was there is whole."""
+
+    def run_to(episodes: int, directory: Path) -> list[bytes]:
+        settings = {"episodes": episodes, "ppo": {"rollout_steps": steps}}
+        run.run(run_config("CartPole-v1", "mace_full", 0, **settings), directory, None, True)
+        return [(directory / name).read_bytes() for name in RESULTS]
+
+    monkeypatch.setenv("MACE_RL_CHECKPOINT_SECONDS", "0")
+    expected, folder = run_to(30, tmp_path / "whole"), tmp_path / "grown"
+    first, update = run_to(before, folder), Trainer.ppo_update
+
+    def update_or_die(trainer, rollout):
+        if len(trainer.records) > 25:
+            raise Killed
+        return update(trainer, rollout)
+
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(Trainer, "ppo_update", update_or_die)
+        run_to(30, folder)
+    assert [(folder / name).read_bytes() for name in RESULTS] == first
+    assert run_to(30, folder)[:-1] == expected[:-1]
+    went_on, resumed = provenance_of(folder)["interruptions"]
+    whole = before if steps == 1 else 0 if before == 1 else went_on["after_episode"]
+    assert went_on["after_episode"] == whole < resumed["after_episode"] <= 25
+    assert (steps, before) != (200, 12) or 0 < whole < before
+
+
+def test_what_cannot_go_on_is_refused_with_the_reason(run_config, tmp_path):
+    def run_to(episodes: int, folder: str, keep: bool = True, **changes) -> None:
+        config = run_config("CartPole-v1", "mace_full", 0, episodes=episodes, **changes)
+        run.run(config, tmp_path / folder, None, keep)
+
+    by_budget = {"beta": pretrained()}
+    run_to(3, "without", keep=False)
+    run_to(3, "other")
+    run_to(3, "budget", **by_budget)
+    before = {folder: content_of(tmp_path / folder) for folder in ("without", "other", "budget")}
+    for folder, episodes, changes, why in (
+        ("without", 4, {}, "config.episodes was 3 and is 4, without a checkpoint to go on from"),
+        ("other", 2, {}, "config.episodes was 3 and is 2"),
+        ("other", 4, {"ppo": {"clip": 0.1}}, "config.episodes was 3 and is 4"),
+        ("budget", 4, by_budget, f"is 4, which beta.rule {RULE!r} needs to know"),
+    ):
+        with refused(ConfigError, rf"{folder} holds a finished run where .*{re.escape(why)}"):
+            run_to(episodes, folder, **changes)
+    assert before == {folder: content_of(tmp_path / folder) for folder in before}

@@ -56,7 +56,8 @@ def parser() -> argparse.ArgumentParser:
     add("--env", required=True, help=which)
     add("--variant", required=True, help="one of the config's variant_settings")
     add("--seed", default=0, type=int, help="(default: 0)")
-    add("--episodes", type=int, help="instead of the config's budget")
+    more = "instead of the config's budget; above that of a finished run, it goes on"
+    add("--episodes", type=int, help=more)
     add("--max-episode-steps", type=int, help="instead of the environment's own time limit")
     several = {"nargs": "+", "action": "extend", "default": [], "metavar": "FILE"}
     over = "YAML files read over the default settings, one after the other"
@@ -145,14 +146,12 @@ def train(arguments: argparse.Namespace) -> None:
     )
     out: Path = arguments.out or default
     if not arguments.restart and finished(config, out):
-        if (out / files.CHECKPOINT).exists():  # killed between the two
-            (out / files.CHECKPOINT).unlink()
         logger.info("%s holds this run already, finished", out)
         return
     from mace_rl.runs import progress, run  # PyTorch takes seconds, a mistake should not
 
     with progress.line(sys.stderr) as observe:
-        run.run(config, out, observe, aside="all" if arguments.restart else "nothing")
+        run.run(config, out, observe, True, aside="all" if arguments.restart else "nothing")
     logger.info("finished: %s", out / files.EPISODES)
 
 

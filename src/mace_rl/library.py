@@ -8,7 +8,7 @@ action = agent.policy([0.0, 0.1, 0.0, -0.1]).sample()
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.run import RunConfig
@@ -73,7 +73,8 @@ def train(
     settings: from the function of that name.
     callback: is called with each episode after the update on it.
     folder: keeps the run, as `mace-rl train --out` does. The same call resumes an interrupted run,
-        without calling back for its episodes again, and only reads a finished one.
+        without calling back for its episodes again, goes on from the last checkpoint of a finished
+        one of fewer episodes, and only reads one that is finished.
     restart: move a run that is in `folder` into a folder below it, and train from the start.
 
     Raises `ConfigError` if `folder` has the results of another run, `RunError` if it has another
@@ -86,6 +87,7 @@ def train(
         raise ConfigError("folder is empty, but should be a path, or None to keep nothing")
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch if folder is None else folder).absolute()
+        aside: Literal["nothing", "all"] = "all" if restart else "nothing"
         if restart or not finished(settings, directory):
-            run(settings, directory, None, False, callback, "all" if restart else "nothing")
+            run(settings, directory, None, folder is not None, callback, aside)
         return Trained(load_agent(directory, trust=True), FinishedRun(directory).rows)

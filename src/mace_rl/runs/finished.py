@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl.base import code_digest, files
-from mace_rl.config.plugins import code_outside
+from mace_rl.config.plugins import code_outside, load
 from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.runs.provenance import difference, identity, read_record
@@ -188,7 +188,8 @@ def read_runs(
 def finished(config: RunConfig, directory: Path) -> bool:
     """Whether `directory` holds the results of this run by the present code and versions.
 
-    Raises `ConfigError` if it holds others, or damaged ones.
+    Not yet, if they are of fewer episodes and a checkpoint is there to go on from. Raises
+    `ConfigError` if it holds others, or damaged ones.
     """
     if not (directory / files.RECORD).exists():
         return False
@@ -199,6 +200,12 @@ def finished(config: RunConfig, directory: Path) -> bool:
     except ConfigError as error:
         raise ConfigError(f"{error}; {WAY_OUT}") from None
     if found != wanted:
+        if (
+            continues(found, wanted, config)
+            and found["config"]["episodes"] < config.episodes
+            and (directory / files.CHECKPOINT).exists()
+        ):
+            return False
         what = f"a finished run {difference_from(found, wanted, config)}"
         raise ConfigError(f"{directory} holds {what}; {WAY_OUT}")
     try:
@@ -212,5 +219,28 @@ def finished(config: RunConfig, directory: Path) -> bool:
 def difference_from(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
     """How the run with the identity `found` differs from the `wanted` one of `config`, in words."""
     code = " or ".join([*config.references().values(), "mace_rl"])
-    only_code = found | {"sources": wanted["sources"]} == wanted
-    return f"of other code, in {code}" if only_code else f"where {difference(found, wanted)}"
+    if found | {"sources": wanted["sources"]} == wanted:
+        return f"of other code, in {code}"
+    reason = ""
+    if found["config"]["episodes"] < config.episodes and only_budget(found, wanted):
+        rule = needs_budget(config)
+        reason = ", without a checkpoint to go on from"
+        reason = f", which beta.rule {rule!r} needs to know" if rule else reason
+    return f"where {difference(found, wanted)}{reason}"
+
+
+def only_budget(found: dict[str, Any], wanted: dict[str, Any]) -> bool:
+    """Whether two identities differ in the number of episodes at most."""
+    episodes = {"episodes": wanted["config"]["episodes"]}
+    return found | {"config": found["config"] | episodes} == wanted
+
+
+def needs_budget(config: RunConfig) -> str | None:
+    """The rule for β if it depends on how many episodes the run has."""
+    rule: str | None = getattr(config.beta, "rule", None)
+    return rule if rule and getattr(load(rule, "beta.rule"), "needs_budget", False) else None
+
+
+def continues(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> bool:
+    """Whether a run with the identity `found` is the beginning of the `wanted` one of `config`."""
+    return found == wanted or (only_budget(found, wanted) and not needs_budget(config))

@@ -25,7 +25,7 @@ from mace_rl.config.run import IDENTITY, RunConfig
 from mace_rl.published import PublishedTrainer
 from mace_rl.runs import checkpoint, provenance
 from mace_rl.runs.agent import ENVIRONMENT, Agent
-from mace_rl.runs.finished import WAY_OUT, difference_from, finished
+from mace_rl.runs.finished import WAY_OUT, continues, difference_from, finished
 from mace_rl.training import resuming
 from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
 from mace_rl.training.resuming import seeded
@@ -59,13 +59,14 @@ def run(
     """Train as `config` says, on one thread, and leave the results in `directory`.
 
     observe: gets `progress_of` the run, as a file in `directory` does.
-    keep_checkpoint: keep a last one, from which deleted results come back without training.
+    keep_checkpoint: keep the last before a rollout that the budget cuts short: from it the same run
+        with more episodes goes on, and deleted results come back.
     after_episode: is called with each episode after the update on it.
     aside: what is moved into a folder below `directory`: files of "others" than this run, or "all".
 
-    Continues from a checkpoint of this configuration, code and versions; does nothing if the run is
-    finished. Raises `RunError` if another process trains in `directory` or other files are in the
-    way, `ConfigError` if another finished run is.
+    Continues from a checkpoint of this configuration, code and versions, or of one with another
+    number of episodes; does nothing if the run is finished. Raises `RunError` if another process
+    trains in `directory` or other files are in the way, `ConfigError` if another finished run is.
     """
     directory = directory.absolute()  # an environment may change the current folder
     directory.mkdir(parents=True, exist_ok=True)
@@ -78,8 +79,8 @@ def run(
         ExitStack() as end,
     ):
         if aside == "nothing" and finished(config, directory):
-            if (directory / files.CHECKPOINT).exists():  # of a run killed at its end
-                (directory / files.CHECKPOINT).unlink()
+            if not keep_checkpoint:
+                (directory / files.CHECKPOINT).unlink(missing_ok=True)  # of one killed at its end
             return
         started = time.monotonic()
         identity, code = provenance.identity(config), provenance.git_state()
@@ -97,10 +98,11 @@ def run(
         file = directory / files.PROGRESS
 
         def save() -> None:
-            with clock.saving():
-                state = {"trainer": trainer.state_dict(), **clock.account()}
-                checkpoint.save(directory / files.CHECKPOINT, identity, state)
+            state = {"trainer": trainer.state_dict(), **clock.account()}
+            checkpoint.save(directory / files.CHECKPOINT, identity, state)
 
+        if keep_checkpoint and state is None:
+            save()
         for records in trainer.run():
             if after_episode:
                 for record in records:
@@ -113,9 +115,10 @@ def run(
                 write_atomically(file, json.dumps(progress))
                 if observe:
                     observe(progress)
-            if clock.checkpoint_due():
-                save()
-        if keep_checkpoint:
+            if clock.checkpoint_due() and not trainer.cut:
+                with clock.saving():
+                    save()
+        if keep_checkpoint and not trainer.cut:
             save()
         write_results(directory, trainer, identity | {"code": code}, clock)
         if not keep_checkpoint:
@@ -140,7 +143,9 @@ def to_continue(
     if path.exists():
         try:
             content = checkpoint.read(path)
-            others = content["identity"] != identity
+            played = len(content["state"]["trainer"]["records"]["episode"])
+            fits = continues(content["identity"], identity, config)
+            others = not fits or played > config.episodes
             other = f" {difference_from(content['identity'], identity, config)}" if others else ""
             reason = f"{directory} holds an unfinished run{other}"
         except checkpoint.CheckpointError as error:
@@ -298,6 +303,7 @@ def write_results(
     directory: Path, trainer: Trainer, identity: dict[str, Any], clock: Clock
 ) -> None:
     """Write the records, the agent and, last, `run.json`; identity: with the code's commit."""
+    (directory / files.RECORD).unlink(missing_ok=True)  # of the run that this one goes on from
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
     state = Agent(trainer.ppo, trainer.environment.given_space).state_dict()

@@ -52,6 +52,7 @@ class Trainer:
         self.noise = streams["actions"]
         self.records: list[EpisodeRecord] = []
         self.diagnostics: list[UpdateRecord] = []
+        self.cut = False  # whether the budget ended the last rollout before it was full
         self.last_episodes = resuming.LastEpisodes(self.environment)
 
     def _make_parts(self, streams: Streams) -> None:
@@ -85,6 +86,7 @@ class Trainer:
                 own_units = self.config.ppo.normalise_returns
                 rollout.append(item.with_normalised_returns() if own_units else item)
                 steps += len(episode)
+        self.cut = steps < self.config.ppo.rollout_steps
         return rollout
 
     def play_episode(self, policy: ActingPolicy) -> Episode:
