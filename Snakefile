@@ -31,7 +31,6 @@ localrules:
     figures,
     picture,
     readings,
-    page,
 
 
 rule all:
@@ -39,7 +38,7 @@ rule all:
     input:
         rules.metrics.output,
         rules.tables.output,
-        rules.table2.output,
+        rules.table2.output if TRAINED else [],
         rules.tables_page.output,
         rules.figures.output,
         expand(rules.picture.output, picture=PICTURES),

@@ -65,8 +65,20 @@ FEWEST_OF_A_STUDY = min(
 DRAWN = {"constants": MEASURED.constants, "solved": MEASURED.solved_return, "forest": LEDGER}
 PICTURES = ["every_seed", *(picture for picture, numbers in DRAWN.items() if numbers)]
 # By environment and variant, whatever the seed.
-RUN_SETTINGS = {run[:2]: study.run_config(*run).settings() for run in RUNS}
-TRAININGS = [(*run, RUN_SETTINGS[run[:2]]["episodes"]) for run in RUNS]
+RUN_SETTINGS = {run[:2]: study.settings_of(*run[:2]) for run in RUNS}
+TRAINED = study.trained()
+
+
+def episodes_of(run, folder):
+    """How many it has; imported runs have as many as they have."""
+    own = RUN_SETTINGS[run[:2]].get("episodes")
+    try:
+        return own or provenance.read_record(Path(folder, files.RECORD))["config"]["episodes"]
+    except provenance.ProvenanceError as error:
+        sys.exit(f"Error in the configuration: {origin}: {error}; mace-import makes it")
+
+
+TRAININGS = [(*run, episodes_of(run, folder)) for run, folder in zip(RUNS, MADE)]
 RUNS_MEASURED = {"runs": TRAININGS, "settings": MEASURED.model_dump()}
 STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours": study.colours}
 
@@ -93,13 +105,13 @@ def shown(file, caption, category="Results"):
 
 
 def one_of(values):
-    """A pattern that matches exactly these values."""
-    return "|".join(re.escape(str(value)) for value in values)
+    """A pattern that matches exactly these values, without any nothing."""
+    return "|".join(re.escape(str(value)) for value in values) or "(?!)"
 
 
 wildcard_constraints:
     env=one_of(FOLDERS),
-    variant=one_of(study.variants),
+    variant=one_of(TRAINED),
     seed=one_of({seed: None for _, _, seed in RUNS}),
 
 
@@ -111,9 +123,9 @@ def run_config(wildcards):
 def ppo_settings():
     """PPO's settings in each environment, and of the variants in it that have others."""
     found = {}
-    for env in study.environments:
-        own = {name: study.run_config(env, name, 0).ppo.model_dump() for name in study.variants}
-        found[env] = own[study.variants[0]]
+    for env in study.environments if TRAINED else ():
+        own = {name: study.run_config(env, name, 0).ppo.model_dump() for name in TRAINED}
+        found[env] = own[TRAINED[0]]
         others = {name: settings for name, settings in own.items() if settings != found[env]}
         found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
     return found
@@ -121,7 +133,8 @@ def ppo_settings():
 
 def own_code():
     """The settings of the runs whose agents are shown, where these name the user's own code."""
-    first = {run[:2]: study.run_config(*run) for run in reversed(RUNS)}  # of its seeds
+    trained = [run for run in reversed(RUNS) if run[1] in TRAINED]
+    first = {run[:2]: study.run_config(*run) for run in trained}  # of its seeds
     shown = [config.settings() for config in first.values()]
     return [settings for settings in shown if code_outside(settings)]
 

@@ -177,7 +177,7 @@ def read_runs(
     found: dict[RunKey, pd.DataFrame] = {}
     for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
         run = FinishedRun(Path(record).parent, trust=True)  # it is only compared
-        wanted = plain[environment, variant] | {"seed": seed}
+        wanted = plain[environment, variant] | {"seed": seed, "episodes": episodes}
         # The record may lack what is new since, and has a default.
         if (own := run.record["config"]) != wanted and (own := run.config.settings()) != wanted:
             raise RecordError(f"{record} is of another run: {difference(own, wanted)}")

@@ -21,19 +21,20 @@ def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) 
 
     One row per environment, variant and metric, in the order of `table`. The interval (NaN with one
     seed) is cut to where the mean must lie. `censored`: how many of the seeds count with the budget
-    E, so that the mean is a lower bound. `episodes`: E. `paper`: its value, if it has one.
+    E, so that the mean is a lower bound. `episodes`: E, of the longest run. `paper`: its value, or
+    none.
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
         for metric in all_metrics(settings):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
             low, high = interval(values, settings)
-            limits = {"episodes": (1, runs["episodes"].iloc[0]), "share": (0, 1)}
+            limits = {"episodes": (1, runs["episodes"].mean()), "share": (0, 1)}
             low, high = np.clip((low, high), *limits.get(metric.unit, (-np.inf, np.inf)))
             censored = int(runs[metric.flag].sum()) if metric.flag in runs else 0
             in_paper = table1.value(str(environment), str(variant), metric.name)
             found = environment, variant, metric.name, values.mean(), float(low), float(high)
-            rows.append((*found, len(values), censored, int(runs["episodes"].iloc[0]), in_paper))
+            rows.append((*found, len(values), censored, int(runs["episodes"].max()), in_paper))
     fractions = any(isinstance(in_paper, float) for *_, in_paper in rows)
     frame = pd.DataFrame(rows, columns=COLUMNS)
     return frame.astype({"paper": "Float64" if fractions else "Int64"})

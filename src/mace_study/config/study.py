@@ -52,6 +52,7 @@ class ShownVariant(Variant):
     """A variant with a label that tables and figures can set."""
 
     label: Annotated[str, AfterValidator(_label)] | None = None
+    imported: bool = False  # whether its runs are others', brought by `mace_study.imported`
 
 
 Seeds = Annotated[
@@ -83,6 +84,16 @@ class Study(RunSettings):
             for variant in self.variants
             for seed in self.environment_seeds.get(environment, self.seeds)
         ]
+
+    def trained(self) -> list[str]:
+        """The variants whose runs are trained here."""
+        return [name for name in self.variants if not self.variant_settings[name].imported]
+
+    def settings_of(self, environment: str, variant: str) -> dict[str, Any]:
+        """The settings in the `run.json` of its runs but for seeds and imported runs' episodes."""
+        if self.variant_settings[variant].imported:
+            return {"environment": environment, "variant": variant, "imported": True}
+        return self.run_config(environment, variant, 0).settings()
 
     @property
     def labels(self) -> dict[str, str]:
@@ -129,8 +140,10 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
             for variant in variants:
                 check_known(variant, study.variant_settings, f"metrics.{key}", "variant_settings")
         known = dict.fromkeys([*study.environments, *study.environment_settings])
-        for environment, variant in itertools.product(known, study.variant_settings):
-            study.run_config(environment, variant, 0)  # checks its settings
+        trained_in = known if study.trained() else study.environment_settings
+        for variant, shown in study.variant_settings.items():
+            for environment in () if shown.imported else trained_in:
+                study.run_config(environment, variant, 0)  # checks its settings
         for environment in study.environment_seeds:
             check_known(environment, known, "environment_seeds", "environments")
         for environment in study.environments:

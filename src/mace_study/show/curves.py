@@ -15,7 +15,7 @@ import seaborn
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mace_rl.training.records import RecordError, RunKey
+from mace_rl.training.records import RunKey
 from mace_study.compare.statistics import interval
 from mace_study.compare.summary import from_to
 from mace_study.config.metrics import FigureConfig, MetricsConfig
@@ -83,15 +83,20 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
 
     `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
     is over the last `window` episodes, or over all there are so far. Of E > 300 episodes only every
-    ⌈E / 300⌉-th is kept, counted back from the last: more could not be seen.
+    ⌈E / 300⌉-th is kept, counted back from the last: more could not be seen. Curves of a variant
+    end with its shortest run.
     Columns: env, variant, seed, episode and the average by its name.
     """
     columns = ["env", "variant", "seed", "episode", shown.name]
     every = shown.zero_is_shown
     variants = {run[1] for run, own in frames.items() if every or own[shown.column].any()}
     curves = []
+    shortest: dict[tuple[str, str], int] = {}
+    for (environment, variant, _), frame in frames.items():
+        known = shortest.get((environment, variant), len(frame))
+        shortest[environment, variant] = min(known, len(frame))
     for (environment, variant, seed), frame in frames.items():
-        values = frame[shown.column].to_numpy()
+        values = frame[shown.column].to_numpy()[: shortest[environment, variant]]
         head = values[: shown.window - 1]
         growing = np.cumsum(head) / np.arange(1, len(head) + 1)
         average = np.concatenate([growing, moving_average(values, shown.window)])
@@ -109,15 +114,12 @@ def mean_curves(
     """The mean over seeds of `seed_curves`, with its pointwise interval.
 
     Columns: env, variant, episode, mean, lower, upper (both NaN with one seed), n (seeds).
-    Raises `RecordError` if the seeds of a variant have not the same episodes.
     """
     columns = ["env", "variant", "episode", "mean", "lower", "upper", "n"]
     curves = []
     for (environment, variant), runs in single_seeds.groupby(["env", "variant"], sort=False):
         wide = runs.pivot(index="episode", columns="seed", values=shown.name)
         values = wide.to_numpy().T  # [seeds, episodes]
-        if np.isnan(values).any():
-            raise RecordError(f"the seeds of {environment}, {variant} differ in their episodes")
         ends = interval(values, settings)
         if shown.limits is not None:  # where the mean lies, the ends of its interval do
             ends = np.clip(ends, *reaching(shown.limits, values))
