@@ -169,6 +169,7 @@ def test_prints_a_row_for_each_seed_and_what_came_out():
     rows = re.findall(r"(?m)^\| (\w+) \|(?:[^|]+\|){4}$", done.stdout)
     assert rows == ["seed", "1000", "1001", "mean"]
     assert "with curiosity minus without, last tenth: " in done.stdout
+    assert re.search(r"(?m)^β, in tenths of training:( 0.40){10}$", done.stdout)
 
 
 @pytest.mark.slow
@@ -187,6 +188,7 @@ def test_help_and_mistakes(monkeypatch, capsys):
     for option, value, least in (("--seeds", 0, 1), ("--steps", -5, 1), ("--first-seed", -1, 0)):
         expected = f"{option} is {value}, but should be at least {least}"
         assert refused(option, str(value)).endswith(expected)
+    assert refused("--beta", "x").endswith("--beta is 'x', but should be a number or learned")
     for name in ("Foo", "CartPole-v9", "nope:Foo-v0"):
         line = refused("--environment", name)
         assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")
@@ -198,12 +200,15 @@ def test_help_and_mistakes(monkeypatch, capsys):
 @pytest.mark.slow
 def test_curiosity_changes_the_policy_and_not_what_is_counted():
     train = runpy.run_path(str(EXAMPLE))["train"]
-    without, with_curiosity = (train("DeepSea10-v0", curious, 1000, 1536) for curious in (0, 1))
+    found = [train("DeepSea10-v0", beta, 1000, 1536) for beta in (None, 0.4, "learned")]
+    (without, with_curiosity, learned), betas = zip(*found, strict=True)
     own = {*np.round(-0.001 * np.arange(11), 6), 0.99}  # Deep Sea's own returns, without a bonus
-    for returns in (without, with_curiosity):
+    for returns in (without, with_curiosity, learned):
         assert len(returns) >= 153 and set(np.round(returns, 6)) <= own
     assert (without[:25] == with_curiosity[:25]).all()  # until the first update, after 256 steps
-    assert (without != with_curiosity).any()
+    assert (without != with_curiosity).any() and (learned != with_curiosity).any()
+    assert betas[0] == pytest.approx(np.zeros(10)) and betas[1] == pytest.approx(np.full(10, 0.4))
+    assert np.ptp(betas[2]) > 0.05
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.spaces import Discrete, MultiBinary, Text, Tuple
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
-from shared import BANDIT, play, refused, vector_of
+from shared import BANDIT, learned, play, refused, vector_of
 from stable_baselines3.common.env_util import make_vec_env
 
 from mace_rl.config.section import ConfigError
@@ -42,10 +42,11 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        *(
-            ({"beta": {"kind": kind, "initial": 0.4}}, "asks for policy gradients and the budget")
-            for kind in ("meta",)
-        ),
+        ({"beta": {"kind": "meta", "initial": 0.4}}, "its objective should be one that asks for"),
+        ({"beta": learned("credit")}, "of kind return, score, progress or words: policy gradients"),
+        ({"beta": "learnt"}, "beta is 'learnt', but it should be a number, 'learned', or a rule"),
+        ({"meta": {"chunks": 8}}, "meta is for a β that is 'learned'"),
+        ({"beta": "learned", "meta": {"chunk": 8}}, "unknown key 'meta.chunk' .* 'chunks'"),
         ({"beta": LEARNS}, "beta.rule has 'test_extras:Noted', which learns from policy"),
         ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),
         ({"beta": 10.5}, "beta.value is 10.5, but .* less than or equal to 10"),

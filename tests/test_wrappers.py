@@ -26,6 +26,7 @@ import mace_rl.environments  # noqa: F401  (registers ours)
 from extras.random_beta import RandomBeta
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController
+from mace_rl.beta.objectives import Score
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.config.beta import ConstantBeta
@@ -33,6 +34,7 @@ from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.wrappers import CuriosityConfig, defaults
 from mace_rl.environments.episode import Episode
 from mace_rl.runs.checkpoint import archive
+from mace_rl.training.factories import meta_adaptation
 from mace_rl.wrapping.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
 
 # So small that buffer and memory get full within a test, and replace what they hold.
@@ -227,6 +229,54 @@ def test_environments_that_end_at_other_times_keep_their_own_episodes(monkeypatc
         np.testing.assert_allclose(moved, 0.02 * episode.observations[:-1, 1], atol=1e-6)
 
 
+def test_a_learned_beta_is_what_the_network_makes_of_the_same_episodes():
+    """The network in PyTorch, shown whole episodes one after the other, as by the trainer."""
+    env = CuriosityReward(gymnasium.make("CartPole-v1"), "learned", seed=5)
+    config, spaces = env.tracker.config, env.tracker.spaces
+    network = meta_adaptation(config.beta, config.meta, spaces, "torch", Streams(5))
+    draws, betas = np.random.default_rng(0), []
+    observation, _ = env.reset(seed=0)
+    for _ in range(120):
+        expected, states, steps, over = network.next_beta(), [observation], [], False
+        while not over:
+            action = int(draws.integers(2))
+            observation, _, terminated, truncated, info = env.step(action)
+            assert info["beta"] == pytest.approx(expected, rel=1e-3)
+            states.append(observation)
+            steps.append((action, info["reward_extrinsic"], info["curiosity"]))
+            over = terminated or truncated
+        actions, rewards, bonus = map(np.array, zip(*steps, strict=True))
+        unknown = np.full(len(steps), np.nan, np.float32)
+        network.next_episode(
+            Episode(np.stack(states), actions, unknown, rewards, terminated), bonus
+        )
+        observation, _ = env.reset()
+        betas.append(expected)
+    assert np.std(betas[:50]) > 0.01 and betas[0] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("mode", [NEXT, SAME])
+def test_what_the_network_learns_of_an_episode_has_its_own_beta(monkeypatch, mode):
+    """Though others have begun and ended since it was asked for."""
+    learned, after = [], Score.after_episode
+
+    def noted(objective, played):
+        learned.append((played.beta, played.extrinsic_return))
+        return after(objective, played)
+
+    monkeypatch.setattr(Score, "after_episode", noted)
+    env = VectorCuriosityReward(vector_of("CartPole-v1", 3, mode), "learned")
+    sums, played = np.zeros(3), []
+    for _, _, terminated, truncated, info in play(env, 600):
+        sums += info["reward_extrinsic"]
+        for i in np.flatnonzero(terminated | truncated):
+            played.append((info["beta"][i], sums[i]))
+            sums[i] = 0
+    assert len(played) > 30 and played[0][0] == pytest.approx(0.4)
+    # Of the first, which begin before any has ended, β is given.
+    assert learned == [one for one in played if one[0] != played[0][0]]
+
+
 @pytest.mark.filterwarnings("ignore:.*(unwrapped version|infinity|We recommend|we recommend)")
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
@@ -259,6 +309,8 @@ def test_spec_makes_the_same_again():
         ("DeepSea10-v0", None, BANDIT),
         ("CartPole-v1", NEXT, RANDOM),
         ("FrozenLake-v1", SAME, 0.4),
+        ("CartPole-v1", None, "learned"),
+        ("FrozenLake-v1", NEXT, "learned"),
     ],
 )
 def test_saved_midway_it_continues_to_the_bit(name, mode, beta, steps):

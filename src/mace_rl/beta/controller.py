@@ -25,6 +25,9 @@ class BetaController(ABC):
     learns = False  # whether `learn` wants policy gradients
     one_at_a_time = False  # whether every episode has to end before the next begins
     needs_budget = False  # whether it is made with episodes=, how many the run will have
+    # What `next_beta` went by, for `next_episode` of that episode: arrays and numbers. Whoever
+    # plays several at once keeps it and puts it back.
+    asked: tuple[Any, ...] | None = None
 
     @abstractmethod
     def next_beta(self) -> float:

@@ -41,10 +41,11 @@ class MetaAdaptation(Stateful, BetaController):
         kind = CompiledMetaNetwork if engine == "compiled" else TorchMetaNetwork
         self.network: LearningNetwork = kind(config, self.reader.inputs, generator)
         self.sequence: np.ndarray | None = None  # what was read for the next β
-        self.asked: tuple[np.ndarray, float, float] | None = None  # for the last: read, o and β
+        self.asked: tuple[np.ndarray, float, float] | None = None  # what was read, o and β
 
     def next_beta(self) -> float:
         """See `BetaController`."""
+        self.asked = None
         if self.sequence is None:  # the first episode's β is given
             return beta_of(self.initial_logit)
         output = self.network.output(self.sequence)

@@ -6,28 +6,32 @@ from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from mace_rl.config.beta import BetaRule
+from mace_rl.config.beta import BetaRule, ByReturns, MetaBeta, MetaConfig
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import DEFAULTS, merge, read_yaml
-from mace_rl.config.run import BETA_SECTIONS
 from mace_rl.config.section import Count, Section
+
+LEARNED = "learned"  # β as in the variant mace_full of config.yaml
 
 
 @cache
 def defaults() -> dict[str, Any]:
-    """The sections `memory` and `novelty` of config.yaml."""
-    training = read_yaml(DEFAULTS)["training"]
-    return {section: training[section] for section in ("memory", "novelty")}
+    """The sections `memory`, `novelty` and `meta` of config.yaml, and how mace_full sets β."""
+    config = read_yaml(DEFAULTS)
+    sections = {name: config["training"][name] for name in ("memory", "novelty", "meta")}
+    return sections | {"beta": config["variant_settings"]["mace_full"]["beta"]}
 
 
 class CuriosityConfig(Section):
     """The settings of R_extrinsic + β · R_curiosity for any agent."""
 
-    beta: BetaRule = Field(discriminator="kind")  # a number is that constant
+    # A number is that constant; `LEARNED` stands for the learned β.
+    beta: MetaBeta | BetaRule = Field(discriminator="kind")
     relevance: bool = True  # False: the bonus is novelty alone, and memory is not used
     centred: bool = True  # what is usual is paid with 0: a long episode as such earns nothing
-    memory: MemoryConfig  # is read over `defaults`, as is the next
+    memory: MemoryConfig  # is read over `defaults`, as are the next two
     novelty: NoveltyConfig
+    meta: MetaConfig  # of a learned β
     discount: float = Field(default=0.99, ge=0, le=1)  # γ of the agent
     rollout_steps: Count = 1  # steps between updates of the agent
     seed: int = Field(default=0, ge=0, lt=2**32)
@@ -39,18 +43,34 @@ class CuriosityConfig(Section):
             raise ValueError("relevance False does not use memory: one of the two should go")
         for section, default in defaults().items():
             given = values.get(section, {})
-            if isinstance(given, Mapping):
+            if section != "beta" and isinstance(given, Mapping):
                 values = {**values, section: merge(default, given)}
+        return values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _meta_is_used(cls, values: dict[str, Any]) -> dict[str, Any]:
+        beta = values.get("beta")
+        learned = beta == LEARNED or (isinstance(beta, Mapping) and beta.get("kind") == "meta")
+        if "meta" in values and not learned:
+            raise ValueError(f"meta is for a β that is {LEARNED!r}: one of the two should go")
         return values
 
     @field_validator("beta", mode="before")
     @classmethod
-    def _not_meta(cls, beta: Any) -> Any:
-        if not isinstance(beta, Mapping):
-            return {"kind": "constant", "value": beta}
-        if beta.get("kind") in {kind for kinds in BETA_SECTIONS.values() for kind in kinds}:
+    def _as_a_rule(cls, beta: Any) -> Any:
+        if beta == LEARNED:
+            return defaults()["beta"]
+        if isinstance(beta, str):
+            raise ValueError(f"it should be a number, {LEARNED!r}, or a rule as in config.yaml")
+        return beta if isinstance(beta, Mapping) else {"kind": "constant", "value": beta}
+
+    @field_validator("beta")
+    @classmethod
+    def _by_returns(cls, beta: MetaBeta | BetaRule) -> MetaBeta | BetaRule:
+        if isinstance(beta, MetaBeta) and not isinstance(beta.objective, ByReturns):
             raise ValueError(
-                "meta-adaptation asks for policy gradients and the budget, which only our trainer "
-                "has: kind should be constant, exponential or custom"
+                "its objective should be one that asks for returns alone, of kind return, score, "
+                "progress or words: policy gradients are our trainer's"
             )
         return beta

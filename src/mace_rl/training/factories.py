@@ -29,6 +29,7 @@ from mace_rl.config.beta import (
     EvidenceObjective,
     ExponentialBeta,
     MetaBeta,
+    MetaConfig,
     MetaObjective,
     NoBonus,
     ProgressObjective,
@@ -61,15 +62,22 @@ def unchecked_controller(
 ) -> BetaController:
     """The same as it is."""
     match config.beta:
-        case MetaBeta(initial=initial, objective=objective):
-            assert config.meta is not None and objective is not None  # `RunConfig` checked that
-            learned = meta_objective(objective, config.meta.sequences, streams["exploration"])
-            own = environment, config.engine, streams["meta"]
-            return MetaAdaptation(config.meta, learned, initial, *own)
+        case MetaBeta() as beta:
+            assert config.meta is not None  # `RunConfig` checked that
+            return meta_adaptation(beta, config.meta, environment, config.engine, streams)
         case ConstantBeta() | ExponentialBeta() | CustomBeta() as rule:
             return beta_rule(rule, streams["beta"], config.episodes)
         case NoBonus():
             raise ValueError("without a bonus there is no β")
+
+
+def meta_adaptation(
+    beta: MetaBeta, config: MetaConfig, spaces: Spaces, engine: str, streams: Streams
+) -> MetaAdaptation:
+    """The meta-adaptation network, which is to set β."""
+    assert beta.objective is not None  # whoever checked `beta` saw to that
+    objective = meta_objective(beta.objective, config.sequences, streams["exploration"])
+    return MetaAdaptation(config, objective, beta.initial, spaces, engine, streams["meta"])
 
 
 def meta_objective(

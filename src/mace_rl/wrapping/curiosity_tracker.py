@@ -14,17 +14,17 @@ import torch
 from mace_rl.agent.advantages import discounted_returns
 from mace_rl.agent.scale import RewardScale, discounted_sums
 from mace_rl.base.rng import Streams
-from mace_rl.base.state import Stateful
+from mace_rl.base.state import Stateful, saved
 from mace_rl.beta.controller import BetaController
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.config.beta import LARGEST_BETA, CustomBeta
+from mace_rl.config.beta import LARGEST_BETA, CustomBeta, MetaBeta
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.finite import require_within
 from mace_rl.numerics.matmul import dot
-from mace_rl.training.factories import beta_rule
+from mace_rl.training.factories import beta_rule, meta_adaptation
 
 USUAL_STEPS = 20  # whose R_curiosity is usual
 PRIOR = 100  # sums of R_curiosity of size 1 that are taken for granted
@@ -59,6 +59,7 @@ class Recording:
 
     beta: float
     unit: float  # see `CuriosityTracker.unit`
+    asked: Any  # see `BetaController`; as the controller has it
     observations: list[np.ndarray]  # the first, and that after each step, float32 [observation]
     actions: list[Any] = field(default_factory=list)  # as an `Episode` has them
     rewards: list[float] = field(default_factory=list)  # extrinsic
@@ -75,15 +76,16 @@ class Recording:
         return Episode(states, actions, unknown, np.array(self.rewards), terminated)
 
     def state_dict(self) -> dict[str, Any]:
-        """Each part as one tensor."""
+        """Each part as one tensor, but for `asked`."""
         parts = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {name: torch.from_numpy(np.array(part)) for name, part in parts.items()}
+        asked = {"asked": saved(parts.pop("asked"))}
+        return asked | {name: torch.from_numpy(np.array(part)) for name, part in parts.items()}
 
     @classmethod
     def from_state(cls, state: dict[str, np.ndarray]) -> "Recording":
         """From the tensors of `state_dict` as arrays."""
-        beta, unit, *lists = state.values()
-        return cls(beta.item(), unit.item(), *map(list, lists))
+        asked, beta, unit, *lists = state.values()
+        return cls(beta.item(), unit.item(), asked and tuple(asked), *map(list, lists))
 
 
 class CuriosityScale(Stateful):
@@ -124,7 +126,11 @@ class CuriosityTracker(Stateful):
         space, size = spaces.given_space, spaces.observation_size
         memory = config.memory if config.relevance else None
         self.curiosity = Curiosity(memory, config.novelty, space, size, streams)
-        self.controller = beta_rule(config.beta, streams["beta"])
+        self.controller: BetaController
+        if isinstance(config.beta, MetaBeta):
+            self.controller = meta_adaptation(config.beta, config.meta, spaces, "compiled", streams)
+        else:
+            self.controller = beta_rule(config.beta, streams["beta"])
         if isinstance(config.beta, CustomBeta):
             require_usable(config.beta.rule, self.controller, environments)
         self.extrinsic = RewardScale(config.discount, 1.0)
@@ -147,7 +153,8 @@ class CuriosityTracker(Stateful):
             self.usual = copy.copy(self.usual_of_ended)
         first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.next_beta()
         require_within("β", beta, largest=LARGEST_BETA)
-        self.recordings[environment] = Recording(beta, self.unit, [first])
+        asked = self.controller.asked
+        self.recordings[environment] = Recording(beta, self.unit, asked, [first])
 
     def steps_of(self, environment: int) -> int:
         """Steps of its unfinished episode."""
@@ -198,6 +205,7 @@ class CuriosityTracker(Stateful):
         for one in recording.bonus:
             self.usual_of_ended.beyond(float(one))
         self.curiosity.remember(episode, discounted_returns(episode.rewards, self.config.discount))
+        self.controller.asked = recording.asked  # several episodes may go on at once
         self.controller.next_episode(episode, bonus)
         self.steps += len(episode)
         if self.steps >= self.config.rollout_steps:
@@ -206,12 +214,13 @@ class CuriosityTracker(Stateful):
 
     def described(self) -> dict[str, Any]:
         """The settings that have to be the same where a state is loaded."""
+        unused = set() if isinstance(self.config.beta, MetaBeta) else {"meta"}
         return {
-            **self.config.model_dump(exclude={"seed"}),  # the generators are in the state
+            **self.config.model_dump(exclude={"seed"} | unused),  # the generators are in the state
             "observation_size": self.spaces.observation_size,
             "observation_space": repr(self.spaces.given_space),
             "environments": len(self.recordings),
-            "form": 10,  # of the state itself
+            "form": 11,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

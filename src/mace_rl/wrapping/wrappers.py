@@ -47,12 +47,13 @@ class CuriosityMixin(RecordConstructorArgs):
     def __init__(
         self,
         env: Any,
-        beta: float | Settings = 0.4,
+        beta: float | str | Settings = 0.4,
         *,
         relevance: bool = True,
         centred: bool = True,
         memory: Settings | None = None,
         novelty: Settings | None = None,
+        meta: Settings | None = None,
         discount: float = 0.99,
         rollout_steps: int = 1,
         seed: int = 0,
@@ -96,11 +97,13 @@ class CuriosityReward(CuriosityMixin, gymnasium.Wrapper[Any, Any, Any, Any]):
     env: observations are of any space that has a flat form, and the agent gets them unchanged;
         actions are Discrete, MultiDiscrete, MultiBinary or Box. Episodes have to end, by a time
         limit or a reset: nothing is learned from one that does not.
-    beta: a number in [0, 10], or a rule that sets β for each episode, as in config.yaml: {"kind":
-        "exponential", …} or "custom". Not "meta", "pretrained" or "hybrid": policy gradients.
+    beta: a number in [0, 10], "learned" for the paper's network as in config.yaml's mace_full, or a
+        rule as there: {"kind": "exponential", …}, "custom", or "meta" with an `objective` that asks
+        for returns alone. The network learns from returns as the agent's episodes end.
     centred: False to pay R_curiosity itself, not what it is beyond its present mean.
     relevance: False for novelty alone, without memory; `memory` is then refused.
-    memory, novelty: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by name.
+    memory, novelty, meta: settings that differ from config.yaml's (`mace_rl.config.wrappers`), by
+        name; meta is the network that learns β.
     discount: γ of the agent (gamma in stable-baselines3), per step.
     rollout_steps: steps between the agent's updates (n_steps there), for rules that ask.
     seed: of the bonus's random numbers; `reset(seed=…)` is the environment's.
@@ -202,12 +205,12 @@ class VectorCuriosityReward(CuriosityMixin, gymnasium.vector.VectorWrapper):
 
 
 def given(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The settings among a constructor's arguments, without memory or novelty if None."""
+    """The settings among a constructor's arguments, without sections that are None."""
     found = {name: arguments[name] for name in CuriosityConfig.model_fields}
     return {
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in found.items()
-        if value is not None or name not in ("memory", "novelty")
+        if value is not None or name not in ("memory", "novelty", "meta")
     }
 
 
