@@ -5,10 +5,11 @@
 
 The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY, the outputs that
 reference/studies.yaml names, and README.md: tables.md with the pictures that are among these. What
-the worlds of reference/worlds/protocol.md say together comes into results/tables/worlds. Pictures
-are reduced to 256 colours. All is compared with reference/tables. New files are kept there, and
-README.md, which only shows the others, is renewed; with --check both are mistakes. With --report
-only the page of one study is made, and not compared.
+the worlds of reference/worlds/protocol.md say together comes into results/tables/worlds, and what
+they say of every reading of the learned β into results/tables/readings. Pictures are reduced to 256
+colours. All is compared with reference/tables. New files are kept there, and README.md, which only
+shows the others, is renewed; with --check both are mistakes. With --report only the page of one
+study is made, and not compared.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from typing import Any
 from PIL import Image
 
 from mace_rl.config.reading import read_yaml
-from tools import kept_runs, worlds
+from tools import kept_runs, specification, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,6 +34,7 @@ STUDIES = Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
+KEPT, READINGS = Path("reference/worlds"), "readings"
 # All but training: what is not kept of a run cannot be asked for.
 RULES = (
     *("metrics", "tables", "table2", "tables_page", "figures", "claims", "picture", "readings"),
@@ -144,6 +146,8 @@ def main() -> None:
         outputs[name] = [*outputs[name], README]
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
+    if asked := specification.make(MADE / KEPT, MADE / READINGS, cores):
+        outputs[READINGS] = asked
     made = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))

@@ -140,12 +140,16 @@ class Perturbed(Objective):
         before, slope = self.sequence, -self.paid(played.extrinsic_return) * self.trace
         self.sequence = played.sequence
         self.trace += (self.perturbation / self.config.noise - self.trace) / self.config.lag
+        self.count_episode()
+        return None if before is None else Lesson([before], slope)
+
+    def count_episode(self) -> None:
+        """Set ξ for the next episode."""
         self.episodes += 1
         if self.episodes % (2 * self.config.window) == 0:
             self.perturbation = self.either_sign()
         elif self.episodes % self.config.window == 0:
             self.perturbation = -self.perturbation
-        return None if before is None else Lesson([before], slope)
 
     @abstractmethod
     def paid(self, extrinsic_return: float) -> float:

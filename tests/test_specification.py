@@ -1,0 +1,77 @@
+"""The paper's claims asked of every reading: families, cut claims, and whether β moves."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from invented import CLAIMS, QUICK, ROBUST, ROOT, STUDY, table_for_claims
+
+from mace_rl.beta.meta import MetaAdaptation
+from mace_rl.runs import run
+from mace_rl.runs.finished import FinishedRun
+from mace_study.compare.specification import STILL, asked_beta, family_of, specification
+
+ADVANTAGE = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.3, "mace_words": -0.2}
+WHOLE = ["C1", "C2", "C5", "C6", "C10"]  # all parts are in Acrobot and CartPole
+CUT = ["C7", "C8", "C9"]  # some are
+
+
+@pytest.mark.parametrize("variant", ["mace_full", "mace_score", "mace_progress", "mace_words"])
+def test_what_the_network_asks_for_is_found_again_from_the_records(
+    run_config, tmp_path, monkeypatch, variant
+):
+    """Expected: the network's own outputs, noted while it trains."""
+    outputs, set_beta = [], MetaAdaptation.next_beta
+
+    def noted(controller):
+        beta = set_beta(controller)
+        outputs.append(controller.asked[1] if controller.asked else 0.0)
+        return beta
+
+    monkeypatch.setattr(MetaAdaptation, "next_beta", noted)
+    config = run_config("CartPole-v1", variant, 3, episodes=130)
+    run.run(config, tmp_path)
+    expected = [1 / (1 + math.exp(-(math.log(0.4 / 0.6) + output))) for output in outputs]
+    assert np.ptp(expected) > 1e-3
+    found = FinishedRun(tmp_path)
+    bound = np.isclose(found.episodes["beta"], 1 / (1 + np.exp([[-6], [6]])), rtol=1e-3).any(0)
+    difference = abs(asked_beta(found) - expected)
+    assert difference[~bound].max() < 1e-4 and (~bound).sum() > 60
+    assert difference.max() < 0.02  # of a logit that was cut off at ±6, with a perturbation of 2
+
+
+def test_claims_are_whole_or_cut_to_the_environments_that_are_there():
+    environments = {"Acrobot-v1", "CartPole-v1"}
+    whole, cut = (
+        next(iter(family_of(CLAIMS, environments, one).families.values())) for one in (True, False)
+    )
+    assert [*whole.claims] == WHOLE and [*cut.claims] == CUT
+    for claim in cut.claims.values():
+        for parts in claim.parts.values():
+            assert {env for part in parts for env in part.environments} <= environments
+    everything = {*STUDY.environments}
+    assert len(next(iter(family_of(CLAIMS, everything, True).families.values())).claims) == 10
+    assert not family_of(CLAIMS, everything, False).families
+
+
+def test_each_reading_is_judged_by_its_own_runs_and_corrected_by_itself():
+    table = table_for_claims(20, ADVANTAGE, 0.02)
+    table = table[table["env"] != "HopperBulletEnv-v0"]
+    words = table["variant"] == "mace_words"
+    columns = [name for name in table if name.startswith("stagnation")]
+    table.loc[words, columns] = np.random.default_rng(0).normal(0, 0.02, (words.sum(), 2))
+
+    def asked(**deviations: float) -> pd.DataFrame:
+        path = ROOT / STUDY.claims
+        found = specification(table, QUICK, path, deviations, ROBUST)
+        return found.set_index(["reading", "claim"])["verdict"]
+
+    both = asked(mace_full=0.2, mace_words=0.2)
+    for alone in (asked(mace_full=0.2), asked(mace_words=0.2)):
+        pd.testing.assert_series_equal(alone, both.loc[[alone.index[0][0]]])
+    assert both["mace_full", "C1"] == both["mace_full", "C9"] == "reproduced"
+    assert both["mace_words", "C1"] == both["mace_words", "C10"] == "not reproduced"
+    still = asked(mace_full=0.2, mace_words=0.04)
+    assert still["mace_words", "C9"] == STILL
+    assert (still.drop([("mace_words", "C9")]) == both.drop([("mace_words", "C9")])).all()
