@@ -13,9 +13,7 @@ configfile: f"{workflow.basedir}/config.yaml"
 
 include: "workflow/rules/study.smk"
 include: "workflow/rules/train.smk"
-include: "workflow/rules/tables.smk"
-include: "workflow/rules/figures.smk"
-include: "workflow/rules/claims.smk"
+include: "workflow/rules/results.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/terminal.smk"
 
@@ -24,13 +22,8 @@ include: "workflow/rules/terminal.smk"
 localrules:
     all,
     metrics,
-    claims,
     tables,
-    table2,
-    tables_page,
-    figures,
-    picture,
-    readings,
+    pictures,
 
 
 rule all:
@@ -38,9 +31,4 @@ rule all:
     input:
         rules.metrics.output,
         rules.tables.output,
-        rules.table2.output if TRAINED else [],
-        rules.tables_page.output,
-        rules.figures.output,
-        expand(rules.picture.output, picture=PICTURES),
-        rules.readings.output if READ else [],
-        rules.claims.output if LEDGER else [],
+        rules.pictures.output,

@@ -36,7 +36,7 @@ def test_what_the_network_asks_for_is_found_again_from_the_records(
     assert np.ptp(expected) > 1e-3
     found = FinishedRun(tmp_path)
     bound = np.isclose(found.episodes["beta"], 1 / (1 + np.exp([[-6], [6]])), rtol=1e-3).any(0)
-    difference = abs(asked_beta(found) - expected)
+    difference = abs(asked_beta(found.episodes["beta"].to_numpy(), found.config) - expected)
     assert difference[~bound].max() < 1e-4 and (~bound).sum() > 60
     assert difference.max() < 0.02  # of a logit that was cut off at ±6, with a perturbation of 2
 

@@ -9,7 +9,7 @@ what is not kept.
 ARCHIVE/ENV/VARIANT.tar.xz has them as seedN/FILE, but the episodes of all seeds column by column,
 without those that the others tell, and each in the form that takes least room: as text, as doubles,
 or as six digits with an exponent. Packing again adds seeds to those that are there; equal runs give
-equal files. `make tables` reads what is there.
+equal files. `make tables` reads what is there, without unpacking it.
 """
 
 import argparse
@@ -25,9 +25,10 @@ import tarfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
+import pandas as pd
 
 from mace_rl.base import files
 from mace_rl.base.files import write_atomically
@@ -46,8 +47,33 @@ NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*\.tar\.xz"
 DAMAGE = (tarfile.TarError, lzma.LZMAError, OSError, EOFError)
 
 
+class Kept(NamedTuple):
+    """A kept run."""
+
+    record: bytes  # its run.json
+    columns: dict[str, list[str]]  # cells of episodes.csv, by `COLUMNS`
+    episodes: bytes  # episodes.csv
+
+
 def read(archive: Path) -> dict[str, bytes]:
     """What is in an archive, by name; `ValueError` with its path for what `write` never wrote."""
+    found = {}
+    for seed, run in runs_of(archive).items():
+        found[f"seed{seed}/{files.RECORD}"] = run.record
+        found[f"seed{seed}/{files.EPISODES}"] = run.episodes
+    return found
+
+
+def frame(run: Kept) -> pd.DataFrame:
+    """The records of a kept run, as `read_episodes` gives them."""
+    told = {name: np.array([*map(float, cells)]) for name, cells in run.columns.items()}
+    told |= {"episode": np.arange(1, len(told["length"]) + 1), "env_steps": told["length"].cumsum()}
+    types = get_type_hints(EpisodeRecord)
+    return pd.DataFrame({name: told[name].astype(kind) for name, kind in types.items()})
+
+
+def runs_of(archive: Path) -> dict[int, Kept]:
+    """The runs in an archive, by seed; `ValueError` as `read`."""
     try:
         if not re.fullmatch(NAME, archive.name):
             raise ValueError("its name is not VARIANT.tar.xz")
@@ -56,7 +82,7 @@ def read(archive: Path) -> dict[str, bytes]:
         raise ValueError(f"{archive} is not as a packed one is: {error}") from None
 
 
-def _read(compressed: bytes) -> dict[str, bytes]:
+def _read(compressed: bytes) -> dict[int, Kept]:
     # Decompressed at once: tarfile's own way takes twice as long.
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MEMORY)
     content = decompressor.decompress(compressed, EXPANDED)
@@ -73,7 +99,7 @@ def _read(compressed: bytes) -> dict[str, bytes]:
     columns = {name: _cells(found, name) for name in COLUMNS}
     if twice := [name for name in found if "/" not in name]:
         raise ValueError(f"it should not have {twice[0]!r} beside another form of it")
-    start = 0
+    start, runs = 0, {}
     for name in [name for name in found if name.endswith(files.RECORD)]:
         record, left = json.loads(found[name]), len(columns["length"]) - start
         episodes, seconds = record["config"]["episodes"], record["seconds"]
@@ -82,13 +108,14 @@ def _read(compressed: bytes) -> dict[str, bytes]:
         if not isinstance(seconds, int | float):
             raise ValueError(f"{name} has {seconds!r} seconds")
         own = {column: values[start : start + episodes] for column, values in columns.items()}
-        found[name.replace(files.RECORD, files.EPISODES)] = together = _together(own)
+        together = _together(own)
         if hashlib.sha256(together).hexdigest() != record["outputs"][files.EPISODES]:
             raise ValueError(f"{name} has other episodes (SHA-256 differs)")
+        runs[int(name.partition("/")[0].removeprefix("seed"))] = Kept(found[name], own, together)
         start += episodes
     if not start or any(len(values) != start for values in columns.values()):
         raise ValueError(f"its runs have {start} episodes together, but its columns others")
-    return found
+    return runs
 
 
 def write(archive: Path, content: dict[str, bytes]) -> None:

@@ -1,31 +1,30 @@
 """The paper's claims asked of every reading of its learned β: reference/readings/protocol.md.
 
-    python -m tools.specification FOLDER GOAL      `make tables` does it, too
-
-FOLDER/WORLD/runs has the runs of each of `WORLDS` that is there. Only a reading all of whose runs
-are there is asked. Into GOAL come the answers, their picture, and a page.
+A part of `make tables`. Only a reading all of whose runs are kept is asked.
 """
 
-import argparse
-import sys
+import json
+import statistics
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
 from pathlib import Path
 
 import pandas as pd
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
-from mace_rl.runs.finished import FinishedRun
+from mace_rl.config.run import RunConfig
 from mace_study.compare.specification import MOVES, asked_beta, specification
 from mace_study.config.metrics import MetricsConfig
-from mace_study.config.study import Study, read_study
+from mace_study.config.study import read_study
 from mace_study.measure.betas import betas_table
 from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import worlds
 from mace_study.show.curves import save_figure
 from mace_study.show.markdown import page
 from mace_study.show.sections import Section
+from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 # By world the folder that its runs are in, and the seeds of each environment.
@@ -40,54 +39,57 @@ READINGS = (
     *("mace_credit_network", "mace_evidence"),
 )
 DECIDES = "robust"
-CORES = 2
 
 
-def measured(run: tuple[Path, MetricsConfig]) -> tuple[pd.DataFrame, float]:
-    """A run's row of metrics.csv and betas.csv, and the standard deviation of its `asked_beta`."""
-    folder, settings = run
-    found = FinishedRun(folder)
-    config = found.record["config"]
-    frames = {(config["environment"], config["variant"], config["seed"]): found.episodes}
+def measured(
+    archive: Path, seeds: range, settings: MetricsConfig
+) -> tuple[pd.DataFrame, list[float]] | None:
+    """Rows of metrics.csv and betas.csv of a variant's runs, and how far each asked β deviates.
+
+    None where runs are lacking.
+    """
+    there = kept_runs.runs_of(archive) if archive.exists() else {}
+    if not {*seeds} <= {*there}:
+        return None
+    frames, moved = {}, []
+    for seed in seeds:
+        frame, own = kept_runs.frame(there[seed]), json.loads(there[seed].record)["config"]
+        frames[own["environment"], own["variant"], seed] = frame
+        if own["variant"] not in BASELINES:
+            config = RunConfig.model_validate(own)
+            moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     both = metrics_table(frames, settings), betas_table(frames, settings)
-    moved = asked_beta(found).std() if config["variant"] not in BASELINES else 0.0
-    return both[0].merge(both[1], on=["env", "variant", "seed"]), float(moved)
+    return both[0].merge(both[1], on=["env", "variant", "seed"]), moved
 
 
 def asked(
-    folder: Path, seeds: Mapping[str, range], study: Study, cores: int
+    archives: Path, seeds: Mapping[str, range], settings: MetricsConfig, cores: int
 ) -> tuple[pd.DataFrame, dict[str, float]]:
     """The runs of one world, and of each reading that is complete there how much its β moves."""
-    places = {
-        name: [
-            folder / "runs" / files.folder_of(env) / name / f"seed{seed}"
-            for env, own in seeds.items()
-            for seed in own
-        ]
+    jobs = [(name, env) for name in (*BASELINES, *READINGS) for env in seeds]
+    places = [archives / files.folder_of(env) / f"{name}.tar.xz" for name, env in jobs]
+    with ProcessPoolExecutor(cores) as pool:
+        made = pool.map(measured, places, (seeds[env] for _, env in jobs), repeat(settings))
+        found = dict(zip(jobs, made, strict=True))
+    whole = {
+        name: [part for env in seeds if (part := found[name, env]) is not None]
         for name in (*BASELINES, *READINGS)
     }
-    whole = {
-        name: own
-        for name, own in places.items()
-        if all((run / files.RECORD).exists() for run in own)
-    }
+    whole = {name: own for name, own in whole.items() if len(own) == len(seeds)}
     if lacking := [name for name in BASELINES if name not in whole]:
-        raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
-    jobs = [(run, study.metrics) for own in whole.values() for run in own]
-    with ProcessPoolExecutor(cores) as pool:
-        rows, moved = zip(*pool.map(measured, jobs, chunksize=20), strict=True)
-    table = pd.concat(rows, ignore_index=True)
-    deviations = pd.Series(moved).groupby(table["variant"]).median()
-    return table, {name: deviations[name] for name in READINGS if name in whole}
+        raise Refusal(f"{archives} lacks runs of {', '.join(lacking)}")
+    table = pd.concat([rows for own in whole.values() for rows, _ in own], ignore_index=True)
+    moved = {name: [one for _, runs in own for one in runs] for name, own in whole.items()}
+    return table, {name: statistics.median(moved[name]) for name in READINGS if name in whole}
 
 
-def make(folder: Path, goal: Path, cores: int) -> list[str]:
+def make(archives: Path, goal: Path, cores: int) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
     study = read_study([ROOT / "config.yaml"])
     found, moved = [], {}
     for world, (place, seeds) in WORLDS.items():
-        if (folder / place / "runs").exists():
-            table, deviations = asked(folder / place, seeds, study, cores)
+        if (archives / place).exists():
+            table, deviations = asked(archives / place, seeds, study.metrics, cores)
             own = specification(table, study.metrics, ROOT / study.claims, deviations, DECIDES)
             found.append(own.assign(world=world))
             moved[world] = deviations
@@ -104,10 +106,7 @@ def make(folder: Path, goal: Path, cores: int) -> list[str]:
     return ["specification.csv", "deviations.csv", "specification.png", "README.md"]
 
 
-ORIGIN = (
-    "By `python -m tools.specification`, from the runs of"
-    " [the protocol](../../readings/protocol.md)."
-)
+ORIGIN = "By `make tables`, from the runs of [the protocol](../../readings/protocol.md)."
 
 
 def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
@@ -142,23 +141,3 @@ def shared(answers: pd.DataFrame) -> pd.Series:
         if DEFAULT in said:
             found[claim] = f"{(said == said[DEFAULT]).sum()} of {len(said)}"
     return pd.Series(found, dtype=object)
-
-
-def main() -> None:
-    """Entry point."""
-    example = "example: python -m tools.specification results/worlds results/worlds/readings"
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], epilog=example)
-    parser.add_argument("folder", type=Path, help="where the worlds' folders are")
-    parser.add_argument("goal", type=Path, help="where the answers go")
-    arguments = parser.parse_args()
-    try:
-        made = make(arguments.folder, arguments.goal, CORES)
-    except (Refusal, OSError) as error:
-        sys.exit(f"specification: {error}")
-    if not made:
-        sys.exit(f"specification: {arguments.folder} has no runs of {' or '.join(WORLDS)}")
-    print(*(arguments.goal / name for name in made), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

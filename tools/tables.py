@@ -3,71 +3,118 @@
     python -m tools.tables [--check] [--cores N]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-The kept runs are unpacked, and Snakemake makes of them, in results/tables/STUDY, the outputs that
-reference/studies.yaml names, and README.md: tables.md with the pictures that are among these. What
-the worlds of reference/worlds/protocol.md say together comes into results/tables/worlds, and what
-they say of every reading of the learned β into results/tables/readings. Pictures are reduced to 256
-colours. All is compared with reference/tables. New files are kept there, and README.md, which only
-shows the others, is renewed; with --check both are mistakes. With --report only the page of one
-study is made, and not compared.
+Of the kept runs are made, in results/tables/STUDY, the outputs that reference/studies.yaml names, by
+the functions that the workflow's rules call, and README.md: tables.md with the pictures that are
+among these. What the worlds of reference/worlds/protocol.md say together comes into
+results/tables/worlds, and what they say of every reading of the learned β into
+results/tables/readings. Pictures are reduced to 256 colours. All is compared with reference/tables.
+New files are kept there, and README.md, which only shows the others, is renewed; with --check both
+are mistakes. With --report only the page of one study is made, and not compared.
 """
 
 import argparse
+import json
 import os
 import re
+import shlex
 import shutil
-import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from functools import reduce
 from itertools import repeat
 from pathlib import Path
 from typing import Any
 
+import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
+
+import pandas as pd
 from PIL import Image
 
-from mace_rl.config.reading import read_yaml
+from mace_rl.base import files
+from mace_rl.base.errors import Refusal
+from mace_rl.config.reading import merge, read_options, read_yaml
+from mace_rl.runs.finished import require_settings
+from mace_rl.training.records import RunKey
+from mace_study import results
+from mace_study.config.study import load_study
+from mace_study.plan import FIGURES, Plan
 from tools import kept_runs, specification, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 
 STUDIES = Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
-PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `tables_page` writes them
+PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `write_page` writes them
 PAGE, TABLES, README = "report.html", "tables.md", "README.md"
 KEPT, READINGS = Path("reference/worlds"), "readings"
-# All but training: what is not kept of a run cannot be asked for.
-RULES = (
-    *("metrics", "tables", "table2", "tables_page", "figures", "claims", "picture", "readings"),
-    "page",
-)
+CONFIG = "config.yaml"
 
 
-def make(name: str, study: dict[str, Any], cores: int) -> None:
-    """Make the `outputs` of one study; `ValueError` with what Snakemake says if it cannot.
+def make(name: str, entry: dict[str, Any], report: bool) -> int:
+    """Make the outputs of one study, or only its page if `report`; returns how many runs it has.
 
-    Where it is started `config/` is the project's, so that the pages name the command.
+    Raises `Refusal` or `ValueError` with the study's name for what cannot be.
     """
-    folder = ROOT / MADE / name
+    try:
+        return _make(name, entry, report)
+    except (Refusal, ValueError, OSError) as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _make(name: str, entry: dict[str, Any], report: bool) -> int:
+    folder, given = MADE / name, entry["configfiles"]
     folder.mkdir(parents=True)
-    (folder / "runs").symlink_to(ROOT / MADE / study["runs"] / "runs", target_is_directory=True)
-    (folder / "config").symlink_to(ROOT / "config", target_is_directory=True)
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
-    command += ["--cores", str(cores), "--allowed-rules", *RULES]
-    command += ["--configfile", *study["configfiles"]]
-    command += ["--config", f"results={folder}", *study["config"]]
-    command += ["--", *(f"{folder}/{output}" for output in study["outputs"])]
-    done = subprocess.run(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    if done.returncode:
-        raise ValueError(f"{name}: {done.stdout.strip()}")
+    layers = [*(read_yaml(Path(file)) for file in (CONFIG, *given)), read_options(entry["config"])]
+    study = load_study(reduce(merge, layers) | {"results": str(folder)}, " + ".join(given))
+    plan = Plan(study, ROOT)
+    frames, records = kept(plan, Path(entry["runs"]))
+    own, outputs = (folder, plan.with_episodes, plan.measured), entry["outputs"]
+    options = ["--config", *entry["config"]] if entry["config"] else []
+    command = shlex.join(["snakemake", "all", "--configfile", *given, *options])
+    pictures = [one for one in (*FIGURES, *plan.pictures) if report or f"{one}.png" in outputs]
+    curves = FIGURES if report else [one for one in FIGURES if one in pictures]
+    read = plan.read and (plan.has_papers or "readings" in pictures)
+    results.measure(frames, plan.measured, folder, curves, plan.paper if read else None)
+    results.tabulate(*own, plan.paper, study.labels)
+    results.write_table2(folder, plan.ppo_settings(), plan.paper)
+    if plan.judged:
+        seconds = sum(record["seconds"] for record in records)
+        results.judge(*own, plan.paper, command, seconds)
+    if report:
+        texts = {
+            file: Path(file).read_text(encoding="utf-8") for file in (CONFIG, *given, plan.claims)
+        }
+        how = command, texts, plan.ppo_settings(), records
+        shown = [Path(run) for run in plan.folders], plan.own_code()
+        style = plan.style | {"layout": {"columns": 3}}
+        results.write_report(*own, plan.paper, plan.paged, plan.judged, how, shown, style)
+    else:
+        every = [*FIGURES, *plan.pictures]
+        results.write_page(*own, plan.paper, plan.tabulated, every, command, plan.judged)
+        results.draw(folder, pictures, *own[1:], plan.paper, plan.style, plan.judged)
+    return len(frames)
 
 
-def make_all(studies: dict[str, Any], cores: int) -> None:
-    """Make the outputs of every study, as many studies at once as there are cores for."""
-    at_once = min(cores, len(studies))
-    with ThreadPoolExecutor(at_once) as pool:
-        list(pool.map(make, studies, studies.values(), repeat(cores // at_once)))
+def kept(plan: Plan, archives: Path) -> tuple[dict[RunKey, pd.DataFrame], list[dict[str, Any]]]:
+    """The records of each run of a study, and its run.json, in the study's order.
+
+    `ValueError` for one that is not kept, `RecordError` for one of another study.
+    """
+    there: dict[tuple[str, str], dict[int, kept_runs.Kept]] = {}
+    frames, records = {}, []
+    for environment, variant, seed in plan.runs:
+        path = archives / files.folder_of(environment) / f"{variant}.tar.xz"
+        pair = environment, variant
+        if pair not in there:
+            there = {pair: kept_runs.runs_of(path)}  # one at a time: each has millions of texts
+        if seed not in there[pair]:
+            raise ValueError(f"{path} lacks seed {seed}")
+        run = there[pair][seed]
+        record = json.loads(run.record)
+        require_settings(record["config"], plan.run_settings[pair] | {"seed": seed}, str(path))
+        frames[environment, variant, seed] = kept_runs.frame(run)
+        records.append(record)
+    return frames, records
 
 
 def write_readme(name: str, outputs: list[str]) -> None:
@@ -125,35 +172,33 @@ def main() -> None:
     if only and only not in studies:
         sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
     wanted = {only: studies[only]} if only else studies
-    archives = dict.fromkeys(study["runs"] for study in wanted.values())
-    for stale in [MADE / only, *(MADE / archive for archive in archives)] if only else [MADE]:
+    for stale in [MADE / only] if only else [MADE]:
         if stale.exists():
             shutil.rmtree(stale)
-    outputs = {name: [PAGE] if only else study["outputs"] for name, study in wanted.items()}
     try:
-        runs = sum(kept_runs.unpack(Path(archive), MADE / archive, cores) for archive in archives)
-        make_all(
-            {name: wanted[name] | {"outputs": [*own, TABLES]} for name, own in outputs.items()},
-            cores,
-        )
+        with ProcessPoolExecutor(min(cores, len(wanted))) as pool:
+            counts = [*pool.map(make, wanted, wanted.values(), repeat(bool(only)))]
     except ValueError as error:
         sys.exit(f"tables: {error}")
     if only:
         print(MADE / only / PAGE)
         return
+    outputs = {name: entry["outputs"] for name, entry in wanted.items()}
     for name in outputs:
         write_readme(name, outputs[name])
         outputs[name] = [*outputs[name], README]
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
-    if asked := specification.make(MADE / KEPT, MADE / READINGS, cores):
+    if asked := specification.make(KEPT, MADE / READINGS, cores):
         outputs[READINGS] = asked
     made = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))
     different = [path for name in outputs for path in difference(name, outputs[name], check)]
     count = sum(map(len, outputs.values()))
-    print(f"{count} tables and figures of {len(studies)} studies from {runs} runs, in {MADE}")
+    print(
+        f"{count} tables and figures of {len(studies)} studies from {sum(counts)} runs, in {MADE}"
+    )
     if different:
         sys.exit("tables: not those that are kept: " + ", ".join(different))
 

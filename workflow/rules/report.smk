@@ -2,18 +2,16 @@
 
 from mace_rl.base.code_digest import PACKAGE
 
-PICTURED = ["figure1", "figure1_seeds", "figure2", "figure2_seeds", *READ]
-
 # Of trainings: imported runs have no agents to show, no settings and no costs.
-if TRAINED == study.variants:
+if plan.trained == study.variants:
 
     # The agents that are shown are no inputs: where runs are kept without them, the page says so. Each
     # run.json, which is an input, has its agent's digest.
     rule page:
         input:
-            **csv(*TABULATED, *PICTURED),
-            **LEDGER,
-            claims=CLAIMS,
+            data=[f"{RESULTS}/{name}.csv" for name in plan.paged],
+            ledger=rules.tables.output.json,
+            claims=plan.claims,
             records=RECORDS,
             # To these the page refers.
             in_print=[f"{RESULTS}/{name}" for name in ("figure1.pdf", "figure2.pdf", "table2.tex")],
@@ -23,15 +21,19 @@ if TRAINED == study.variants:
             f"{RESULTS}/logs/report.log",
         localrule: True
         params:
-            **RUNS_MEASURED,
-            style=STYLE | {"layout": {"columns": 3}},
+            runs=plan.with_episodes,
+            settings=plan.measured.model_dump(),
+            style=plan.style | {"layout": {"columns": 3}},
             command=COMMAND,
             configuration={
-                file: Path(file).read_text(encoding="utf-8") for file in (*config_files, CLAIMS)
+                file: Path(file).read_text(encoding="utf-8")
+                for file in (*config_files, plan.claims)
             },
-            ppo=ppo_settings(),
-            own=own_code(),
+            ppo=plan.ppo_settings(),
+            own=plan.own_code(),
+            paged=plan.paged,
+            judged=plan.judged,
             template=provenance.file_digest(PACKAGE.parent / "mace_study" / "show" / "report.html"),
-            code=code("page.py", MEASURED),
+            code=code("page.py", plan.measured),
         script:
             "../scripts/page.py"

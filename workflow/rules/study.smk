@@ -13,10 +13,9 @@ from mace_rl.base import files
 from mace_rl.config.reading import merge, read_options, read_yaml
 from mace_rl.config.section import ConfigError
 from mace_study.config.study import load_study
-from mace_rl.config.plugins import code_outside, source_files
+from mace_rl.config.plugins import source_files
 from mace_rl.environments import registered
-from mace_study.compare.claims_config import FEWEST_SEEDS, read_claims, too_few
-from mace_study.measure.metrics import all_metrics, out_of_reach
+from mace_study.plan import FIGURES, Plan
 from mace_rl.runs import provenance, slurm
 from mace_rl.runs.finished import in_the_way
 from mace_rl.base.code_digest import digest
@@ -36,51 +35,19 @@ try:
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {error}")
 try:
-    MEASURED = study.metrics.within(study.environments, study.variants)
-    all_metrics(MEASURED)  # the user's own among them: are they metrics?
-    # Here, or else in the project: as where Snakemake is started in another folder.
-    places = [Path(study.claims), Path(workflow.basedir, study.claims)]
-    CLAIMS = os.path.relpath(next(filter(Path.exists, places), places[0]))
-    paper = read_claims(study, CLAIMS)
+    plan = Plan(study, Path(workflow.basedir))
+    plan.with_episodes
 except ConfigError as error:
     sys.exit(f"Error in the configuration: {origin}: {error}")
+except provenance.ProvenanceError as error:
+    sys.exit(f"Error in the configuration: {origin}: {error}; mace-import makes it")
 
-RESULTS = os.path.normpath(study.results)
+RESULTS = plan.results
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
-RUNS = study.runs()
 FOLDERS = {files.folder_of(env): env for env in study.environments}
-MADE = [RUN.format(env=files.folder_of(env), variant=name, seed=seed) for env, name, seed in RUNS]
-EPISODES, RECORDS = ([f"{run}/{file}" for run in MADE] for file in (files.EPISODES, files.RECORD))
-HAS_PAPERS = paper.table1.is_within(study.environments, study.variants)
-# What counts episodes can be read in several ways.
-COUNTED = [metric.name for metric in all_metrics(MEASURED) if metric.unit == "episodes"]
-READ = ["readings"] if set(COUNTED) & set(paper.table1.metrics) else []
-# The ledger is for a study that has all that a family of claims is about.
-LACKING = paper.lacking(study.environments, study.variants, MEASURED)
-LEDGER = {} if all(LACKING.values()) else {"ledger": f"{RESULTS}/claims.json"}
-FEWEST_OF_A_STUDY = min(
-    len(study.environment_seeds.get(env, study.seeds)) for env in FOLDERS.values()
-)
-# Those that the configuration has the numbers for.
-DRAWN = {"constants": MEASURED.constants, "solved": MEASURED.solved_return, "forest": LEDGER}
-PICTURES = ["every_seed", *(picture for picture, numbers in DRAWN.items() if numbers)]
-# By environment and variant, whatever the seed.
-RUN_SETTINGS = {run[:2]: study.settings_of(*run[:2]) for run in RUNS}
-TRAINED = study.trained()
-
-
-def episodes_of(run, folder):
-    """How many it has; imported runs have as many as they have."""
-    own = RUN_SETTINGS[run[:2]].get("episodes")
-    try:
-        return own or provenance.read_record(Path(folder, files.RECORD))["config"]["episodes"]
-    except provenance.ProvenanceError as error:
-        sys.exit(f"Error in the configuration: {origin}: {error}; mace-import makes it")
-
-
-TRAININGS = [(*run, episodes_of(run, folder)) for run, folder in zip(RUNS, MADE)]
-RUNS_MEASURED = {"runs": TRAININGS, "settings": MEASURED.model_dump()}
-STYLE = {"layout": study.figure.model_dump(), "labels": study.labels, "colours": study.colours}
+RECORDS = [f"{run}/{files.RECORD}" for run in plan.folders]
+# Of the data in tables.md, what is measured on runs and not computed of that.
+MEASURED = ("metrics", "betas", "readings")
 
 
 def command(*words, options=options):
@@ -92,11 +59,6 @@ def command(*words, options=options):
 
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
 COMMAND = command("all", options=[one for one in options if not one.startswith("results=")])
-
-
-def csv(*names):
-    """Data of the study, by the names of their files."""
-    return {name: f"{RESULTS}/{name}.csv" for name in names}
 
 
 def shown(file, caption, category="Results"):
@@ -111,32 +73,13 @@ def one_of(values):
 
 wildcard_constraints:
     env=one_of(FOLDERS),
-    variant=one_of(TRAINED),
-    seed=one_of({seed: None for _, _, seed in RUNS}),
+    variant=one_of(plan.trained),
+    seed=one_of({seed: None for _, _, seed in plan.runs}),
 
 
 def run_config(wildcards):
     """All that determines a run besides the code."""
     return study.run_config(FOLDERS[wildcards.env], wildcards.variant, int(wildcards.seed))
-
-
-def ppo_settings():
-    """PPO's settings in each environment, and of the variants in it that have others."""
-    found = {}
-    for env in study.environments if TRAINED else ():
-        own = {name: study.run_config(env, name, 0).ppo.model_dump() for name in TRAINED}
-        found[env] = own[TRAINED[0]]
-        others = {name: settings for name, settings in own.items() if settings != found[env]}
-        found |= {f"{env}: {study.labels[name]}": settings for name, settings in others.items()}
-    return found
-
-
-def own_code():
-    """The settings of the runs whose agents are shown, where these name the user's own code."""
-    trained = [run for run in reversed(RUNS) if run[1] in TRAINED]
-    first = {run[:2]: study.run_config(*run) for run in trained}  # of its seeds
-    shown = [config.settings() for config in first.values()]
-    return [settings for settings in shown if code_outside(settings)]
 
 
 def most_work(wildcards):

@@ -75,7 +75,7 @@ def outcome():
 
         names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
         data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
-        table = tables.table1(tables.named(data, study.labels), MEASURED, paper.table1)
+        table = tables.table1(tables.named(data, study.labels), plan.measured, plan.paper.table1)
         lines = [f"\n{title()}\n", markdown.plain(table), ""]
     lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
     others = sorted(asked.intersection(made).difference(lie))
@@ -86,7 +86,7 @@ def outcome():
     if missing := sorted(path for path in asked | of_all if not os.path.exists(path)):
         more = f" and {len(missing) - 1} more" if missing[1:] else ""
         lines.append(f"Not there, and not made now: {missing[0]}{more}")
-    pageless = TRAINED != study.variants or f"{RESULTS}/report.html" in made
+    pageless = plan.trained != study.variants or f"{RESULTS}/report.html" in made
     if f"{RESULTS}/tables.md" in made and not pageless:
         here = os.path.realpath("Snakefile") == os.path.realpath(workflow.main_snakefile)
         where = [] if here else ["-s", os.path.relpath(workflow.main_snakefile)]
@@ -97,8 +97,9 @@ def outcome():
 def title():
     from mace_study.show.tables import counts_episodes
 
-    name = f"Table 1: {paper.table1.caption[0].lower()}{paper.table1.caption[1:]}"
-    if not counts_episodes(MEASURED, paper.table1):
+    caption = plan.paper.table1.caption
+    name = f"Table 1: {caption[0].lower()}{caption[1:]}"
+    if not counts_episodes(plan.measured, plan.paper.table1):
         return f"{name}; *: best"
     return f"{name} in episodes; *: lowest; †k: k seeds never get there"
 
@@ -109,7 +110,7 @@ LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows a
 logger.addFilter(in_short)
 
 
-def plan():
+def asked_for():
     """The runs that are asked for, of which some are due, for `mace-rl status`."""
     due = set(workflow.dag.needrun_jobs())
     jobs = [job for job in workflow.dag.jobs if job.rule.name == "train"]
@@ -146,19 +147,11 @@ onstart:
     lock = occupy(RESULTS)
     if workflow.executor_plugin.name != "touch":
         make_room()
-    planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": plan()}
+    planned = {"cores": workflow.cores if workflow.local_exec else None, "runs": asked_for()}
     os.makedirs(f"{RESULTS}/logs", exist_ok=True)
     files.write_atomically(f"{RESULTS}/{files.PLAN}", json.dumps(planned))
-    for line in study.metrics.incomplete(study.environments, study.variants):
+    for line in plan.remarks(registered()):
         logger.info(line)
-    for episodes in sorted({episodes for *_, episodes in TRAININGS}):
-        if short := out_of_reach(MEASURED, episodes):
-            logger.info(f"{episodes} episodes are too few for {', '.join(short)}")
-    for title, lacking in {} if LEDGER else LACKING.items():
-        if not set(lacking).intersection(registered()):  # about environments that it has
-            logger.info(f"of {CLAIMS}, {title} are not judged: the study lacks {lacking[0]}")
-    if LEDGER and FEWEST_OF_A_STUDY < FEWEST_SEEDS:
-        logger.info(f"no claim can have a verdict: {too_few(FEWEST_OF_A_STUDY)}")
     due, runs = sum(run["due"] for run in planned["runs"]), len(planned["runs"])
     if workflow.executor_plugin.name != "touch":
         to_train = f"{due} of {runs} runs to train"
@@ -168,7 +161,7 @@ onstart:
 onsuccess:
     global LAST
     LAST += ("Elapsed time: ",)
-    for folder in map(Path, MADE):
+    for folder in map(Path, plan.folders):
         # Not of an unfinished run, which was not asked for this time.
         if (folder / files.RECORD).exists():
             (folder / files.CHECKPOINT).unlink(missing_ok=True)

@@ -1,16 +1,17 @@
-"""metrics.csv and betas.csv: what is measured on each run."""
+"""What is measured on each run, and what figures and readings show of all of them."""
+
+from pathlib import Path
 
 from job import job
 
-from mace_rl.base.files import write_atomically
 from mace_rl.runs.finished import read_runs
+from mace_study import results
+from mace_study.compare.claims_config import parse_claims
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.betas import betas_table
-from mace_study.measure.metrics_csv import metrics_table
 
 with job(snakemake):
-    given = snakemake.params
+    found, given, folder = snakemake.input, snakemake.params, Path(snakemake.output.metrics).parent
     settings = MetricsConfig.model_validate(given.settings)
-    runs = read_runs(snakemake.input.records, given.runs, given.run_settings)
-    for path, table in zip(snakemake.output, (metrics_table, betas_table), strict=True):
-        write_atomically(path, table(runs, settings).to_csv(index=False))
+    frames = read_runs(found.records, given.runs, given.run_settings)
+    paper = parse_claims(found.claims, settings.learned) if given.read else None
+    results.measure(frames, settings, folder, given.figures, paper)

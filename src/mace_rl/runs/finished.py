@@ -178,11 +178,18 @@ def read_runs(
     for record, (environment, variant, seed, episodes) in zip(records, runs, strict=True):
         run = FinishedRun(Path(record).parent, trust=True)  # it is only compared
         wanted = plain[environment, variant] | {"seed": seed, "episodes": episodes}
-        # The record may lack what is new since, and has a default.
-        if (own := run.record["config"]) != wanted and (own := run.config.settings()) != wanted:
-            raise RecordError(f"{record} is of another run: {difference(own, wanted)}")
+        require_settings(run.record["config"], wanted, record)
         found[environment, variant, seed] = run.frame(episodes)
     return found
+
+
+def require_settings(own: Mapping[str, Any], wanted: Mapping[str, Any], origin: str) -> None:
+    """`RecordError`, begun by `origin`, unless a run with the configuration `own` is as `wanted`.
+
+    wanted: plain values. A record may lack what is new since, and has a default.
+    """
+    if own != wanted and (own := check(RunConfig, own, origin).settings()) != wanted:
+        raise RecordError(f"{origin} is of another run: {difference(dict(own), dict(wanted))}")
 
 
 def finished(config: RunConfig, directory: Path) -> bool:

@@ -14,7 +14,7 @@ import pandas as pd
 from mace_rl.base.rng import Streams
 from mace_rl.beta.objectives import Perturbed, Progress, Score
 from mace_rl.config.beta import MetaBeta, ProgressObjective, ScoreObjective
-from mace_rl.runs.finished import FinishedRun
+from mace_rl.config.run import RunConfig
 from mace_study.compare.claims_config import ClaimsConfig, PartsConfig, parse_claims
 from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import MetricsConfig
@@ -24,10 +24,13 @@ MOVES = 0.05  # median standard deviation of the asked β over a training, from 
 STILL, NOT_ASKED = "β does not move", ""
 
 
-def asked_beta(run: FinishedRun) -> np.ndarray:
-    """β as its rule asks for it, [E]: without the perturbation that a reading adds to learn by."""
-    beta, generator = run.episodes["beta"].to_numpy(), Streams(run.config.seed)["exploration"]
-    match run.config.beta:
+def asked_beta(beta: np.ndarray, config: RunConfig) -> np.ndarray:
+    """β as its rule asks for it, without the perturbation that a reading adds to learn by, [E].
+
+    beta: that of a run's episodes.
+    """
+    generator = Streams(config.seed)["exploration"]
+    match config.beta:
         case MetaBeta(objective=ScoreObjective() as settings):
             added = perturbations(Score(settings, generator), len(beta))
         case MetaBeta(objective=ProgressObjective() as settings):

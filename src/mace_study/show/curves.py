@@ -128,6 +128,12 @@ def mean_curves(
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
 
 
+def read_curves(path: Path) -> pd.DataFrame:
+    """What `seed_curves` or `mean_curves` was written as, to the bit."""
+    how: Any = {"keep_default_na": False, "na_values": [""], "float_precision": "round_trip"}
+    return pd.read_csv(path, dtype={"env": str, "variant": str}, **how)
+
+
 def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
     """`limits`, the upper one raised to the largest of `values`: β may be above 1."""
     return limits[0], max(limits[1], values.max())

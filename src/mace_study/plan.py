@@ -1,0 +1,170 @@
+"""What a study comes to: its runs, how they are measured, and what can be made of them.
+
+Planning the workflow imports this module, so it stays clear of torch and numba.
+"""
+
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mace_rl.base import files
+from mace_rl.config.plugins import code_outside
+from mace_rl.runs.provenance import read_record
+from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, read_claims, too_few
+from mace_study.config.metrics import MetricsConfig
+from mace_study.config.study import Study
+from mace_study.measure.metrics import all_metrics, out_of_reach
+
+FIGURES = ("figure1", "figure2")  # over training: 1 is the paper's, 2 shows β
+
+
+class Plan:
+    """A study and the file of claims that it names; both are checked."""
+
+    def __init__(self, study: Study, project: Path) -> None:
+        """project: where the file of claims is looked for if it is not in the current folder.
+
+        Raises `ConfigError` for metrics, imported runs or claims that do not work.
+        """
+        self.study = study
+        self.measured: MetricsConfig = study.metrics.within(study.environments, study.variants)
+        all_metrics(self.measured)  # the user's own among them: are they metrics?
+        places = [Path(study.claims), Path(project, study.claims)]
+        self.claims = os.path.relpath(next(filter(Path.exists, places), places[0]))
+        self.paper: ClaimsConfig = read_claims(study, self.claims)
+        self.results = os.path.normpath(study.results)
+
+    # --- Runs -----------------------------------------------------------------------------------
+
+    @cached_property
+    def runs(self) -> list[tuple[str, str, int]]:
+        """Environment, variant and seed of each."""
+        return self.study.runs()
+
+    @cached_property
+    def folders(self) -> list[str]:
+        """Where each of `runs` is."""
+        return [
+            f"{self.results}/runs/{files.folder_of(environment)}/{variant}/seed{seed}"
+            for environment, variant, seed in self.runs
+        ]
+
+    @cached_property
+    def trained(self) -> list[str]:
+        """The variants whose runs are trained here, not imported."""
+        return self.study.trained()
+
+    @cached_property
+    def run_settings(self) -> dict[tuple[str, str], dict[str, Any]]:
+        """By environment and variant the settings of its runs, whatever the seed."""
+        return {run[:2]: self.study.settings_of(*run[:2]) for run in self.runs}
+
+    @cached_property
+    def with_episodes(self) -> list[tuple[str, str, int, int]]:
+        """`runs`, each with how many episodes it has; imported ones have what they have.
+
+        Raises `ProvenanceError` for one that has not been imported.
+        """
+        found = []
+        for run, folder in zip(self.runs, self.folders, strict=True):
+            own = self.run_settings[run[:2]].get("episodes")
+            own = own or read_record(Path(folder, files.RECORD))["config"]["episodes"]
+            found.append((*run, own))
+        return found
+
+    # --- What can be made -----------------------------------------------------------------------
+
+    @property
+    def has_papers(self) -> bool:
+        """Whether there is all that the paper's Table 1 has."""
+        return self.paper.table1.is_within(self.study.environments, self.study.variants)
+
+    @property
+    def read(self) -> bool:
+        """Whether Table 1 can be read in several ways, as what counts episodes can."""
+        counted = {one.name for one in all_metrics(self.measured) if one.unit == "episodes"}
+        return bool(counted.intersection(self.paper.table1.metrics))
+
+    @cached_property
+    def lacking(self) -> dict[str, list[str]]:
+        """By family of claims, what it needs and the study lacks."""
+        return self.paper.lacking(self.study.environments, self.study.variants, self.measured)
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is a ledger: for a study that has all that a family of claims is about."""
+        return not all(self.lacking.values())
+
+    @cached_property
+    def pictures(self) -> list[str]:
+        """Those that the study has the numbers for, beside `FIGURES`."""
+        drawn: dict[str, Any] = {
+            "every_seed": True,
+            "constants": self.measured.constants,
+            "solved": self.measured.solved_return,
+            "forest": self.judged,
+            "readings": self.read,
+        }
+        return [name for name, numbers in drawn.items() if numbers]
+
+    @property
+    def tabulated(self) -> list[str]:
+        """The data of tables.md, by the names of their files."""
+        # The last is seconds of reading that only Table 1 is worth.
+        papers = ["readings"] if self.read and self.has_papers else []
+        names = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
+        return [*names, *papers]
+
+    @property
+    def paged(self) -> list[str]:
+        """The data of report.html, by the names of their files."""
+        curves = [name for figure in FIGURES for name in (figure, f"{figure}_seeds")]
+        readings = ["readings"] if self.read else []
+        return list(dict.fromkeys([*self.tabulated, *curves, *readings]))
+
+    # --- How it is shown ------------------------------------------------------------------------
+
+    @property
+    def style(self) -> dict[str, Any]:
+        """The arguments of `plot_style` beside the measures."""
+        study = self.study
+        layout = study.figure.model_dump()
+        return {"layout": layout, "labels": study.labels, "colours": study.colours}
+
+    def ppo_settings(self) -> dict[str, dict[str, Any]]:
+        """PPO's settings in each environment, and of the variants in it that have others."""
+        found: dict[str, dict[str, Any]] = {}
+        for env in self.study.environments if self.trained else ():
+            own = {
+                name: self.study.run_config(env, name, 0).ppo.model_dump() for name in self.trained
+            }
+            found[env] = own[self.trained[0]]
+            for name, settings in own.items():
+                if settings != found[env]:
+                    found[f"{env}: {self.study.labels[name]}"] = settings
+        return found
+
+    def own_code(self) -> list[dict[str, Any]]:
+        """The settings of the runs whose agents are shown, where these name the user's own code."""
+        first = {run[:2]: run for run in reversed(self.runs) if run[1] in self.trained}
+        shown = [self.study.run_config(*run).settings() for run in first.values()]
+        return [settings for settings in shown if code_outside(settings)]
+
+    def remarks(self, known: Mapping[str, Any]) -> list[str]:
+        """What cannot be said of this study, in a line each; known: Gymnasium's registry."""
+        study = self.study
+        lines = study.metrics.incomplete(study.environments, study.variants)
+        for episodes in sorted({episodes for *_, episodes in self.with_episodes}):
+            if short := out_of_reach(self.measured, episodes):
+                lines.append(f"{episodes} episodes are too few for {', '.join(short)}")
+        for title, lacking in {} if self.judged else self.lacking.items():
+            if not set(lacking).intersection(known):  # about environments that it has
+                lines.append(
+                    f"of {self.claims}, {title} are not judged: the study lacks {lacking[0]}"
+                )
+        seeds = (study.environment_seeds.get(env, study.seeds) for env in study.environments)
+        if self.judged and (fewest := min(map(len, seeds))) < FEWEST_SEEDS:
+            lines.append(f"no claim can have a verdict: {too_few(fewest)}")
+        return lines

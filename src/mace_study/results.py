@@ -1,0 +1,195 @@
+"""What is made of a study's runs, file by file in its folder of results.
+
+`measure` reads the runs; all others read only what that left. The workflow has a rule for runs,
+tables and pictures each, and `make tables` calls all of them one after the other.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from mace_rl.base.files import write_atomically
+from mace_rl.config.agent import PPOConfig
+from mace_rl.training.records import RunKey, read_table
+from mace_study.compare import ledger, verdicts
+from mace_study.compare.aggregate import aggregate
+from mace_study.compare.claims_config import ClaimsConfig
+from mace_study.compare.comparisons import comparisons
+from mace_study.compare.readings import readings
+from mace_study.compare.summary import split, summary
+from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.betas import betas_columns, betas_table
+from mace_study.measure.metrics_csv import metrics_table, read_metrics
+from mace_study.show import markdown, sections
+from mace_study.show.latex import table1_latex, table2_latex
+
+Runs = Sequence[Sequence[str | int]]  # of each environment, variant, seed, number of episodes
+
+
+def write_table(path: Path, table: pd.DataFrame) -> None:
+    """Write a CSV file."""
+    write_atomically(path, table.to_csv(index=False))
+
+
+def measure(
+    frames: Mapping[RunKey, pd.DataFrame],
+    settings: MetricsConfig,
+    folder: Path,
+    figures: Iterable[str],
+    paper: ClaimsConfig | None,
+) -> None:
+    """metrics.csv, betas.csv, the curves of the figures, and the readings of `paper`'s Table 1.
+
+    frames: the records of each run; paper: None without readings.csv.
+    """
+    from mace_study.show.curves import mean_curves, quantity, seed_curves  # draws: a second
+
+    write_table(folder / "metrics.csv", metrics_table(frames, settings))
+    write_table(folder / "betas.csv", betas_table(frames, settings))
+    for figure in figures:
+        shown = quantity(figure.removeprefix("figure"), settings)
+        seeds = seed_curves(frames, shown)
+        write_table(folder / f"{figure}_seeds.csv", seeds)
+        write_table(folder / f"{figure}.csv", mean_curves(seeds, shown, settings))
+    if paper is not None:
+        write_table(folder / "readings.csv", readings(frames, settings, paper.table1))
+
+
+def tabulate(
+    folder: Path,
+    runs: Runs,
+    settings: MetricsConfig,
+    paper: ClaimsConfig,
+    labels: Mapping[str, str],
+) -> None:
+    """Table 1 and its supplement, comparisons, and all environments together."""
+    table = read_metrics(folder / "metrics.csv", runs, settings)
+    table1, supplement = split(summary(table, settings, paper.table1), paper.table1)
+    write_table(folder / "comparisons.csv", comparisons(table, settings))
+    write_table(folder / "aggregate.csv", aggregate(table, settings))
+    write_table(folder / "table1.csv", table1)
+    write_table(folder / "supplement.csv", supplement)
+    write_atomically(folder / "table1.tex", table1_latex(table1, labels, settings, paper.table1))
+
+
+def write_table2(folder: Path, ppo: Mapping[str, Any], paper: ClaimsConfig) -> None:
+    """The hyperparameters; ppo: by environment."""
+    own = {env: PPOConfig.model_validate(settings) for env, settings in ppo.items()}
+    write_atomically(folder / "table2.tex", table2_latex(own, paper.table2))
+
+
+def judge(
+    folder: Path,
+    runs: Runs,
+    settings: MetricsConfig,
+    paper: ClaimsConfig,
+    command: str,
+    seconds: float,
+) -> None:
+    """The ledger: what of the paper holds, and what of our own questions (docs/metrics.md).
+
+    seconds: that all runs took; command: that makes them.
+    """
+    table = read_metrics(folder / "metrics.csv", runs, settings)
+    betas = read_table(folder / "betas.csv", betas_columns(settings))
+    table = table.merge(betas, how="left", on=["env", "variant", "seed"], validate="1:1")
+    answers, hours = verdicts.ledger(table, settings, paper), seconds / 3600
+    cost = {"command": command, "runs": len(table), "core_hours": hours}
+    write_atomically(folder / "claims.json", ledger.to_json(cost, answers))
+    origin = f"`{command}`: {len(table)} runs, {hours:.1f} core-hours."
+    page = markdown.page("Does it hold?", origin, sections.of_ledger(answers, paper))
+    write_atomically(folder / "claims.md", page)
+
+
+def data_of(folder: Path, names: Iterable[str], judged: bool) -> dict[str, Path]:
+    """The files of data with these names, and the ledger if there is one."""
+    found = {name: folder / f"{name}.csv" for name in names}
+    return found | ({"ledger": folder / "claims.json"} if judged else {})
+
+
+def write_page(
+    folder: Path,
+    runs: Runs,
+    settings: MetricsConfig,
+    paper: ClaimsConfig,
+    names: Iterable[str],
+    pictures: Sequence[str],
+    command: str,
+    judged: bool,
+) -> None:
+    """tables.md: every table on one page, beside `pictures`; names: of its data."""
+    data, answers = sections.read_data(data_of(folder, names, judged), runs, settings)
+    shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings, {})]
+    origin = f"`{command}`: {len(runs)} runs."
+    page = markdown.page("The tables of this study", origin, shown, pictures)
+    write_atomically(folder / "tables.md", page)
+
+
+def draw(
+    folder: Path,
+    names: Iterable[str],
+    runs: Runs,
+    settings: MetricsConfig,
+    paper: ClaimsConfig,
+    style: Mapping[str, Any],
+    judged: bool,
+) -> None:
+    """Figures and pictures, each as PDF and PNG, from the data that is in `folder`.
+
+    style: of `plot_style`; judged: whether there is a ledger.
+    """
+    from mace_study.show import curves, pictures
+
+    names = list(names)
+    files = data_of(folder, ["metrics", *{"readings"}.intersection(names)], judged)
+    data, answers = sections.read_data(files, runs, settings)
+    look = curves.plot_style(settings, **style)
+    for name in names:
+        both = folder / f"{name}.pdf", folder / f"{name}.png"
+        if name in pictures.PICTURES:
+            picture = pictures.PICTURES[name]
+            table = picture.data(pictures.Source(data, answers, settings, paper))
+            if name not in files:
+                write_table(folder / f"{name}.csv", table)
+            figure = picture.draw(table, look)
+        else:
+            shown = curves.quantity(name.removeprefix("figure"), settings)
+            own = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
+            means, seeds = map(curves.read_curves, own)
+            figure = curves.draw_figure(means, seeds, shown, look)
+        # The first layout differs a little, and readings.png was always that.
+        curves.save_figure(figure, *(both[::-1] if name == "readings" else both))
+
+
+def write_report(
+    folder: Path,
+    runs: Runs,
+    settings: MetricsConfig,
+    paper: ClaimsConfig,
+    names: Iterable[str],
+    judged: bool,
+    how: tuple[str, Mapping[str, str], Mapping[str, Any], Sequence[Mapping[str, Any]]],
+    shown: tuple[Sequence[Path], Sequence[Mapping[str, Any]]],
+    style: Mapping[str, Any],
+) -> None:
+    """report.html: all of it on one page.
+
+    names: of the data; how: the command, the configuration's files, PPO's settings by environment,
+    and every run.json; shown: the runs' folders, whose agents are filmed, and the settings of those
+    that name the user's own code.
+    """
+    from mace_study.show import animations, curves, report
+
+    data, answers = sections.read_data(data_of(folder, names, judged), runs, settings)
+    command, configuration, ppo, records = how
+    own = {env: PPOConfig.model_validate(one) for env, one in ppo.items()}
+    first: dict[tuple[Any, ...], Path] = {}  # of its seeds, by environment and variant
+    for run, place in zip(runs, shown[0], strict=True):
+        first.setdefault(tuple(run[:2]), place)
+    films = animations.animations(first, style["labels"], folder, shown[1])
+    made = report.Provenance(command, configuration, own, records)
+    look = curves.plot_style(settings, **style)
+    page = report.page(data, answers, paper, made, films, settings, look)
+    write_atomically(folder / "report.html", page)
