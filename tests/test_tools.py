@@ -126,14 +126,14 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
 
     studies.write_text(yaml.safe_dump({"small": wanted, "bad": wanted | {"config": ["seeds=[2]"]}}))
     output, error = tabulate()
-    assert "tables: bad: " in error and "seed2/run.json" in error and not output
+    assert "tables: bad: " in error and "ppo.tar.xz lacks seed 2" in error and not output
     assert tabulate("--report", "small")[0] == "results/tables/small/report.html\n"
     assert "<!DOCTYPE html>" in (tmp_path / "results/tables/small/report.html").read_text()
     assert "--report is 'none', but should be one of bad, small" in tabulate("--report", "none")[1]
     [archive] = (tmp_path / "reference/small").rglob("*.tar.xz")
     archive.write_bytes(archive.read_bytes()[:1000])
     assert tabulate("--report", "small")[1].startswith(
-        "tables: reference/small/CartPole-v1/ppo.tar"
+        "tables: small: reference/small/CartPole-v1/ppo.tar"
     )
 
 

@@ -3,8 +3,8 @@
     python -m tools.tables [--check] [--cores N]        (make tables)
     python -m tools.tables --report STUDY   (make report)
 
-Of the kept runs are made, in results/tables/STUDY, the outputs that reference/studies.yaml names, by
-the functions that the workflow's rules call, and README.md: tables.md with the pictures that are
+Of the kept runs are made, in results/tables/STUDY, the outputs that reference/studies.yaml names,
+by the functions that the workflow's rules call, and README.md: tables.md with the pictures that are
 among these. What the worlds of reference/worlds/protocol.md say together comes into
 results/tables/worlds, and what they say of every reading of the learned β into
 results/tables/readings. Pictures are reduced to 256 colours. All is compared with reference/tables.
@@ -73,8 +73,8 @@ def _make(name: str, entry: dict[str, Any], report: bool) -> int:
     command = shlex.join(["snakemake", "all", "--configfile", *given, *options])
     pictures = [one for one in (*FIGURES, *plan.pictures) if report or f"{one}.png" in outputs]
     curves = FIGURES if report else [one for one in FIGURES if one in pictures]
-    read = plan.read and (plan.has_papers or "readings" in pictures)
-    results.measure(frames, plan.measured, folder, curves, plan.paper if read else None)
+    readings = plan.read and (plan.has_papers or "readings" in pictures)
+    results.measure(frames, plan.measured, folder, curves, plan.paper if readings else None)
     results.tabulate(*own, plan.paper, study.labels)
     results.write_table2(folder, plan.ppo_settings(), plan.paper)
     if plan.judged:
