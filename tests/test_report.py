@@ -84,8 +84,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         place = folder / "results/runs" / env / variant / f"seed{seed}"
         run(study.run_config(env, variant, seed), place)
     command = [sys.executable, "-m", "snakemake", "--snakefile", ROOT / "Snakefile", "--cores", "2"]
-    command += "--allowed-rules metrics tables pictures page --configfile tiny.yaml -- page".split()
-    command += ["results/tables.md"]
+    command += ["--allowed-rules", "metrics", "tables", "pictures", "page"]
+    command += ["--configfile", "tiny.yaml", "--", "page", "results/tables.md"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return folder
