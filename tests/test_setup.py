@@ -37,8 +37,9 @@ def checkout(tmp_path):
     folder.mkdir()
     (tmp_path / "stub").write_text(STUB)
     (tmp_path / "stub").chmod(0o755)
-    for name in (*LOCKS, "Makefile", "pyproject.toml"):
-        shutil.copy(ROOT / name, folder)
+    for name in (*LOCKS, "Makefile", "pyproject.toml", "tools/setup"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
     return folder
 
 
@@ -126,7 +127,7 @@ def without_python(tmp_path, monkeypatch):
 
 
 def fetched(checkout):
-    command = ["make", "--silent", "fetched"]
+    command = ["tools/setup", "fetched"]
     run = subprocess.run(command, cwd=checkout, capture_output=True, text=True, timeout=300)
     return run.stdout.strip(), run.stderr
 

@@ -109,7 +109,7 @@ class PPO(ActorCritic, Stateful):
         return self.advantage_scales[kind].value if self.config.scale_advantages else 1.0
 
     def unit(self, kind: str) -> float:
-        """The unscaled reward that an advantage of 1, where β weighs it, stands for."""
+        """Raw reward per unit of scaled advantage."""
         return self.reward_scale(kind) * self.advantage_scale(kind)
 
     def update(self, batch: Batch, returns: Mapping[str, np.ndarray]) -> Update:

@@ -56,7 +56,7 @@ def saved(value: Any) -> Any:
 
 
 def restored(current: Any, state: Any) -> Any:
-    """The value that `saved` made `state` of, to replace `current`; where possible it, changed."""
+    """Rebuild a value from a checkpoint, reusing `current`'s memory where shapes match."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current

@@ -60,16 +60,16 @@ def lstm_states(sequence, network):
     cells, hidden = np.zeros((2, steps + 1, size), np.float32)
     for t in range(steps):
         add_product(hidden[t : t + 1], network.weight_hh, gates[t : t + 1])
-        gate, before, cell, shown = gates[t], cells[t], cells[t + 1], hidden[t + 1]
+        gate, cell_before, cell, hidden_after = gates[t], cells[t], cells[t + 1], hidden[t + 1]
         sigmoids, candidate = gate[: 3 * size], gate[3 * size :]
         for j in range(3 * size):
             sigmoids[j] = sigmoid(sigmoids[j])
         for j in range(size):
             candidate[j] = tanh(candidate[j])
         for j in range(size):
-            cell[j] = gate[size + j] * before[j] + gate[j] * candidate[j]
+            cell[j] = gate[size + j] * cell_before[j] + gate[j] * candidate[j]
         for j in range(size):
-            shown[j] = gate[2 * size + j] * tanh(cell[j])
+            hidden_after[j] = gate[2 * size + j] * tanh(cell[j])
     return gates, cells, hidden
 
 

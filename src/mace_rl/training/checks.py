@@ -40,7 +40,7 @@ class Located:
 
 
 class Checked:
-    """A part of which everything is as it is, but for what a subclass checks."""
+    """A proxy of `part`; subclasses check what it returns."""
 
     def __init__(self, part: Any) -> None:
         object.__setattr__(self, "part", part)

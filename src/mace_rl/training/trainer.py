@@ -7,9 +7,11 @@ advantages of each episode's reward and of its curiosity bonus, and lets it beco
 (`collect`, `advantages`). Then the β controller learns (`meta_update`), and PPO updates the policy
 with both advantages, weighed by β (`ppo_update`). What they use is in the folders `agent` (PPO),
 `bonus` (novelty, episodic memory), `beta` (schedules, meta network) and `environments`; `factories`
-makes it as the settings ask for. Where β meets the advantage: `experience.weigh`. PPO's clipped
-loss: `agent.torch_learner`; its gradient in compiled code: `agent.compiled_learner`. The meta
-network's loss: `beta.network`.
+makes it as the settings ask for. Where β meets the bonus: `experience.weigh`; before that, where
+`ppo.normalise_returns` asks for returns in units of each episode's total reward (*plain*),
+`Experience.with_normalised_returns`; in the public code's trainer, `published`, the reward itself.
+PPO's clipped loss: `agent.torch_learner`; its gradient in compiled code: `agent.compiled_learner`.
+What the meta network learns from: `beta.objectives`.
 """
 
 from collections.abc import Iterator

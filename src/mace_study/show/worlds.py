@@ -47,7 +47,10 @@ def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
 
 
 def _decisive(judged: Judgement) -> tuple[Any, ...]:
-    # A part reversed beside one shown makes a claim absent, though no part is.
+    """Outcome and verdict; difference, low, high and p_holm of the part that decides.
+
+    A part reversed beside one shown makes a claim absent, though no part is.
+    """
     of_parts = judged.outcome, "reversed"
     deciding = next(
         own for what in of_parts if (own := [one for one in judged.parts if one.outcome == what])
