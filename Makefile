@@ -28,7 +28,7 @@ PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxp
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick test-wheel tables report bench verify cross-cpu kill-test slurm-test archive image-test lint lock audit clean help setup
+.PHONY: all quick test test-quick test-wheel tables bench verify cross-cpu kill-test slurm-test archive image-test lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -47,9 +47,6 @@ test-wheel: setup ## the wheel in environments of its own: newest, lowest, Debia
 
 tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
 	@$(IN_VENV) tools.tables --cores $(CORES) $(if $(CI),--check)
-
-report: setup ## one page of a kept study, without training: verdicts and figures (STUDY=tuned)
-	@$(IN_VENV) tools.tables --cores $(CORES) --report $(or $(STUDY),tuned)
 
 bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a change slower? (minutes)
 	@$(call one_of,BENCH,quick)

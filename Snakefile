@@ -2,7 +2,6 @@
 
     snakemake -j2 all                                      the paper's budgets (hours)
     snakemake -j2 all --configfile config/reduced.yaml     the same at small budgets (minutes)
-    snakemake -j2 page                                     all of it on one page
 
 Defaults of the command line are in profiles/default/config.yaml.
 """
@@ -14,7 +13,6 @@ configfile: f"{workflow.basedir}/config.yaml"
 include: "workflow/rules/study.smk"
 include: "workflow/rules/train.smk"
 include: "workflow/rules/results.smk"
-include: "workflow/rules/report.smk"
 include: "workflow/rules/terminal.smk"
 
 

@@ -1,6 +1,5 @@
 """Figures and pictures: their data against pandas, scipy and loops, and what files they give."""
 
-import html
 import math
 from dataclasses import replace
 from itertools import product
@@ -144,7 +143,7 @@ def test_labels_are_plain_text(monkeypatch):
     for label in ("$$", r"$\notacommand{$", r"$\lambda$ & <50 %> #~^{}", "long " * 12):
         monkeypatch.setitem(LABELS, "ppo", label)
         figure = draw()
-        assert f">{html.escape(label, quote=False)}<" in c.figure_as_svg(figure)
+        assert label in [text.get_text() for text in figure.legends[0].get_texts()]
         figure.draw_without_rendering()  # lays it out
         assert figure.legends[0].get_window_extent().width < figure.bbox.width
 

@@ -15,7 +15,6 @@ from mace_rl.runs.finished import FinishedRun
 from mace_study import imported
 
 CLAIMS = """
-report: {title: Others, question: "Is B better?", about: They say so.}
 table1: {caption: Final return, metrics: [final_return], variants: {a: A, b: B}, values: {}}
 ways: {by return: by what is learned}
 families:

@@ -1,7 +1,6 @@
 """The tables, figures and verdicts of the studies that are kept, without training.
 
     python -m tools.tables [--check] [--cores N]        (make tables)
-    python -m tools.tables --report STUDY   (make report)
 
 Of the kept runs are made, in results/tables/STUDY, the outputs that reference/studies.yaml names,
 by the functions that the workflow's rules call, and README.md: tables.md with the pictures that are
@@ -9,7 +8,7 @@ among these. What the worlds of reference/worlds/protocol.md say together comes 
 results/tables/worlds, and what they say of every reading of the learned β into
 results/tables/readings. Pictures are reduced to 256 colours. All is compared with reference/tables.
 New files are kept there, and README.md, which only shows the others, is renewed; with --check both
-are mistakes. With --report only the page of one study is made, and not compared.
+are mistakes.
 """
 
 import argparse
@@ -21,7 +20,6 @@ import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import reduce
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -45,23 +43,23 @@ ROOT = Path(__file__).resolve().parent.parent
 STUDIES = Path("reference/studies.yaml")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
 PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `write_page` writes them
-PAGE, TABLES, README = "report.html", "tables.md", "README.md"
+TABLES, README = "tables.md", "README.md"
 KEPT, READINGS = Path("reference/worlds"), "readings"
 CONFIG = "config.yaml"
 
 
-def make(name: str, entry: dict[str, Any], report: bool) -> int:
-    """Make the outputs of one study, or only its page if `report`; returns how many runs it has.
+def make(name: str, entry: dict[str, Any]) -> int:
+    """Make the outputs of one study; returns how many runs it has.
 
     Raises `Refusal` or `ValueError` with the study's name for what cannot be.
     """
     try:
-        return _make(name, entry, report)
+        return _make(name, entry)
     except (Refusal, ValueError, OSError) as error:
         raise ValueError(f"{name}: {error}") from None
 
 
-def _make(name: str, entry: dict[str, Any], report: bool) -> int:
+def _make(name: str, entry: dict[str, Any]) -> int:
     folder, given = MADE / name, entry["configfiles"]
     folder.mkdir(parents=True)
     layers = [*(read_yaml(Path(file)) for file in (CONFIG, *given)), read_options(entry["config"])]
@@ -71,8 +69,8 @@ def _make(name: str, entry: dict[str, Any], report: bool) -> int:
     own, outputs = (folder, plan.with_episodes, plan.measured), entry["outputs"]
     options = ["--config", *entry["config"]] if entry["config"] else []
     command = shlex.join(["snakemake", "all", "--configfile", *given, *options])
-    pictures = [one for one in (*FIGURES, *plan.pictures) if report or f"{one}.png" in outputs]
-    curves = FIGURES if report else [one for one in FIGURES if one in pictures]
+    pictures = [one for one in (*FIGURES, *plan.pictures) if f"{one}.png" in outputs]
+    curves = [one for one in FIGURES if one in pictures]
     readings = plan.read and (plan.has_papers or "readings" in pictures)
     results.measure(frames, plan.measured, folder, curves, plan.paper if readings else None)
     results.tabulate(*own, plan.paper, study.labels)
@@ -80,18 +78,9 @@ def _make(name: str, entry: dict[str, Any], report: bool) -> int:
     if plan.judged:
         seconds = sum(record["seconds"] for record in records)
         results.judge(*own, plan.paper, command, seconds)
-    if report:
-        texts = {
-            file: Path(file).read_text(encoding="utf-8") for file in (CONFIG, *given, plan.claims)
-        }
-        how = command, texts, plan.ppo_settings(), records
-        shown = [Path(run) for run in plan.folders], plan.own_code()
-        style = plan.style | {"layout": {"columns": 3}}
-        results.write_report(*own, plan.paper, plan.paged, plan.judged, how, shown, style)
-    else:
-        every = [*FIGURES, *plan.pictures]
-        results.write_page(*own, plan.paper, plan.tabulated, every, command, plan.judged)
-        results.draw(folder, pictures, *own[1:], plan.paper, plan.style, plan.judged)
+    every = [*FIGURES, *plan.pictures]
+    results.write_page(*own, plan.paper, plan.tabulated, every, command, plan.judged)
+    results.draw(folder, pictures, *own[1:], plan.paper, plan.style, plan.judged)
     return len(frames)
 
 
@@ -158,7 +147,6 @@ def main() -> None:
         description=__doc__.splitlines()[0], epilog="example: python -m tools.tables --check"
     )
     parser.add_argument("--check", action="store_true", help="keep and renew nothing")
-    parser.add_argument("--report", metavar="STUDY", help="make only this study's page")
     parser.add_argument("--cores", default="all", metavar="N", help="jobs at once, default: all")
     arguments = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
@@ -166,24 +154,16 @@ def main() -> None:
         if not arguments.cores.isdecimal() or not int(arguments.cores):
             parser.error(f"--cores is {arguments.cores!r}, but should be all, or at least 1")
         cores = int(arguments.cores)
-    check, only = arguments.check, arguments.report
     os.chdir(ROOT)
     studies = read_yaml(STUDIES)
-    if only and only not in studies:
-        sys.exit(f"tables: --report is {only!r}, but should be one of {', '.join(studies)}")
-    wanted = {only: studies[only]} if only else studies
-    for stale in [MADE / only] if only else [MADE]:
-        if stale.exists():
-            shutil.rmtree(stale)
+    if MADE.exists():
+        shutil.rmtree(MADE)
     try:
-        with ProcessPoolExecutor(min(cores, len(wanted))) as pool:
-            counts = [*pool.map(make, wanted, wanted.values(), repeat(bool(only)))]
+        with ProcessPoolExecutor(min(cores, len(studies))) as pool:
+            counts = [*pool.map(make, studies, studies.values())]
     except ValueError as error:
         sys.exit(f"tables: {error}")
-    if only:
-        print(MADE / only / PAGE)
-        return
-    outputs = {name: entry["outputs"] for name, entry in wanted.items()}
+    outputs = {name: entry["outputs"] for name, entry in studies.items()}
     for name in outputs:
         write_readme(name, outputs[name])
         outputs[name] = [*outputs[name], README]
@@ -194,7 +174,9 @@ def main() -> None:
     made = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))
-    different = [path for name in outputs for path in difference(name, outputs[name], check)]
+    different = [
+        path for name in outputs for path in difference(name, outputs[name], arguments.check)
+    ]
     count = sum(map(len, outputs.values()))
     print(
         f"{count} tables and figures of {len(studies)} studies from {sum(counts)} runs, in {MADE}"

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl.base import files
-from mace_rl.config.plugins import code_outside
 from mace_rl.runs.provenance import read_record
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, read_claims, too_few
 from mace_study.config.metrics import MetricsConfig
@@ -117,13 +116,6 @@ class Plan:
         names = ["metrics", "betas", "table1", "supplement", "comparisons", "aggregate"]
         return [*names, *papers]
 
-    @property
-    def paged(self) -> list[str]:
-        """The data of report.html, by the names of their files."""
-        curves = [name for figure in FIGURES for name in (figure, f"{figure}_seeds")]
-        readings = ["readings"] if self.read else []
-        return list(dict.fromkeys([*self.tabulated, *curves, *readings]))
-
     # --- How it is shown ------------------------------------------------------------------------
 
     @property
@@ -145,12 +137,6 @@ class Plan:
                 if settings != found[env]:
                     found[f"{env}: {self.study.labels[name]}"] = settings
         return found
-
-    def own_code(self) -> list[dict[str, Any]]:
-        """The settings of the runs whose agents are shown, where these name the user's own code."""
-        first = {run[:2]: run for run in reversed(self.runs) if run[1] in self.trained}
-        shown = [self.study.run_config(*run).settings() for run in first.values()]
-        return [settings for settings in shown if code_outside(settings)]
 
     def remarks(self, known: Mapping[str, Any]) -> list[str]:
         """What cannot be said of this study, in a line each; known: Gymnasium's registry."""

@@ -121,7 +121,7 @@ def write_page(
 ) -> None:
     """tables.md: every table on one page, beside `pictures`; names: of its data."""
     data, answers = sections.read_data(data_of(folder, names, judged), runs, settings)
-    shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings, {})]
+    shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings)]
     origin = f"`{command}`: {len(runs)} runs."
     page = markdown.page("The tables of this study", origin, shown, pictures)
     write_atomically(folder / "tables.md", page)
@@ -161,35 +161,3 @@ def draw(
             figure = curves.draw_figure(means, seeds, shown, look)
         # The first layout differs a little, and readings.png was always that.
         curves.save_figure(figure, *(both[::-1] if name == "readings" else both))
-
-
-def write_report(
-    folder: Path,
-    runs: Runs,
-    settings: MetricsConfig,
-    paper: ClaimsConfig,
-    names: Iterable[str],
-    judged: bool,
-    how: tuple[str, Mapping[str, str], Mapping[str, Any], Sequence[Mapping[str, Any]]],
-    shown: tuple[Sequence[Path], Sequence[Mapping[str, Any]]],
-    style: Mapping[str, Any],
-) -> None:
-    """report.html: all of it on one page.
-
-    names: of the data; how: the command, the configuration's files, PPO's settings by environment,
-    and every run.json; shown: the runs' folders, whose agents are filmed, and the settings of those
-    that name the user's own code.
-    """
-    from mace_study.show import animations, curves, report
-
-    data, answers = sections.read_data(data_of(folder, names, judged), runs, settings)
-    command, configuration, ppo, records = how
-    own = {env: PPOConfig.model_validate(one) for env, one in ppo.items()}
-    first: dict[tuple[Any, ...], Path] = {}  # of its seeds, by environment and variant
-    for run, place in zip(runs, shown[0], strict=True):
-        first.setdefault(tuple(run[:2]), place)
-    films = animations.animations(first, style["labels"], folder, shown[1])
-    made = report.Provenance(command, configuration, own, records)
-    look = curves.plot_style(settings, **style)
-    page = report.page(data, answers, paper, made, films, settings, look)
-    write_atomically(folder / "report.html", page)

@@ -86,11 +86,6 @@ def outcome():
     if missing := sorted(path for path in asked | of_all if not os.path.exists(path)):
         more = f" and {len(missing) - 1} more" if missing[1:] else ""
         lines.append(f"Not there, and not made now: {missing[0]}{more}")
-    pageless = plan.trained != study.variants or f"{RESULTS}/report.html" in made
-    if f"{RESULTS}/tables.md" in made and not pageless:
-        here = os.path.realpath("Snakefile") == os.path.realpath(workflow.main_snakefile)
-        where = [] if here else ["-s", os.path.relpath(workflow.main_snakefile)]
-        lines.append(f"All of it on one page: {command(*where, 'page')}")
     return "\n".join(lines)
 
 

@@ -35,15 +35,6 @@ LEARNED = "mace_full"  # what the file calls the learned β
 FEWEST_SEEDS = 10  # with fewer nothing is decided: that would be an anecdote
 
 
-class ReportConfig(Section):
-    """The head of the report."""
-
-    title: str
-    question: str
-    about: str
-    tasks: dict[str, str] = Field(default={})  # by environment, what an agent is to do there
-
-
 class Table1Config(Section):
     """The paper's Table 1."""
 
@@ -145,11 +136,10 @@ class FamilyConfig(Section):
 class ClaimsConfig(Section):
     """The whole file."""
 
-    report: ReportConfig
     variants: dict[str, str] = Field(default={})  # what they are called in few words
     table1: Table1Config
     table2: Table2Config = Field(default=Table2Config())
-    ways: dict[str, str]  # to measure a claim, each with what the report says of it
+    ways: dict[str, str]  # to measure a claim, each with what it is for
     families: dict[str, FamilyConfig] = Field(default={})
 
     def lacking(
@@ -251,7 +241,6 @@ def _names(claims: ClaimsConfig) -> Iterator[tuple[str, str, Iterable[str]]]:
     yield "table1.variants", "variant", table1.variants
     yield "table1.values", "environment", table1.values
     yield "table2", "setting", [*claims.table2.rows, *claims.table2.others]
-    yield "report.tasks", "environment", claims.report.tasks
     for title, family in claims.families.items():
         for name, claim in family.claims.items():
             yield f"families.{title}.claims.{name}.parts", "way", claim.parts

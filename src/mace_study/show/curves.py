@@ -1,6 +1,5 @@
 """The figures: what runs do over training, as data and as pictures; equal data, equal files."""
 
-import io
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -231,20 +230,10 @@ def save_figure(figure: Figure, *paths: str | Path) -> None:
             figure.savefig(path, dpi=DOTS_PER_INCH, metadata=metadata)
 
 
-def figure_as_svg(figure: Figure) -> str:
-    """A figure as an SVG file without background, its text as text."""
-    file = io.StringIO()
-    fields = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    with style():
-        figure.savefig(file, format="svg", transparent=True, metadata=fields)
-    return file.getvalue()
-
-
 @contextmanager
 def style() -> Iterator[None]:
     """The settings to draw and to save with, none of them the user's: saving lays text out."""
     fonts = {"font.family": "DejaVu Sans", "pdf.fonttype": 42}  # this font comes with matplotlib
-    fonts |= {"svg.fonttype": "none", "svg.hashsalt": "mace_rl"}  # text as text; ids that stay
     fonts |= {"text.parse_math": False}  # a label may have a $
     with matplotlib.rc_context():
         matplotlib.rcdefaults()

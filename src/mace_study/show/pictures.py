@@ -75,7 +75,7 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
 def constants(source: Source) -> pd.DataFrame:
     """The mean return of training of every variant, with its role, from metrics.csv's frame."""
     runs, settings = source.data["metrics"], source.settings
-    assert settings.constants is not None  # `fits` has asked
+    assert settings.constants is not None  # `Plan.pictures` has asked
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
     roles[settings.constants.learned] = LEARNED
@@ -310,17 +310,16 @@ def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
 
 
 class Picture(NamedTuple):
-    """What makes the data of a picture, what draws it, and whether there is anything to draw."""
+    """What makes the data of a picture, and what draws it."""
 
     data: Callable[[Source], pd.DataFrame]
     draw: Callable[[pd.DataFrame, PlotStyle], Figure]
-    fits: Callable[[Source], bool]
 
 
 PICTURES = {
-    "every_seed": Picture(every_seed, draw_every_seed, lambda source: True),
-    "constants": Picture(constants, draw_constants, lambda source: bool(source.settings.constants)),
-    "solved": Picture(solved, draw_solved, lambda source: bool(source.settings.solved_return)),
-    "forest": Picture(forest, draw_forest, lambda source: bool(source.answers)),
-    "readings": Picture(readings, draw_readings, lambda source: "readings" in source.data),
+    "every_seed": Picture(every_seed, draw_every_seed),
+    "constants": Picture(constants, draw_constants),
+    "solved": Picture(solved, draw_solved),
+    "forest": Picture(forest, draw_forest),
+    "readings": Picture(readings, draw_readings),
 }

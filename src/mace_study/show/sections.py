@@ -79,11 +79,8 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
             yield Section(f"Part by part: {how}", PARTS, frame, level=3)
 
 
-def of_runs(
-    data: Data, claims: ClaimsConfig, settings: MetricsConfig, names: Mapping[str, str]
-) -> list[Section]:
-    """Everything but the ledger, with these names of the variants."""
-    data = {name: tables.named(frame, names) for name, frame in data.items()}
+def of_runs(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> list[Section]:
+    """Everything but the ledger."""
     asked = [
         (key.partition(".")[0], one.metric)
         for own in claims.families.values()

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
-from mace_rl.runs.progress import duration
 from mace_study.compare.claims_config import Table1Config, Table2Config
 from mace_study.compare.ledger import Answer, Finding
 from mace_study.compare.readings import in_order, ranked, title
@@ -258,23 +257,6 @@ def _in_short(part: pd.Series) -> Cell:
     size = f", {part['size']}" if part["outcome"] in ("shown", "reversed") else ""
     numbers = (f"{name} {part[name].values[0].text}" for name in ("n", *SIZES))
     return part["difference"]._replace(note=f"{', '.join(numbers)}: {part['outcome']}{size}")
-
-
-def costs(
-    records: Sequence[Mapping[str, Any]], runs: pd.DataFrame, labels: Mapping[str, str]
-) -> pd.DataFrame:
-    """What the runs of each environment and variant took, by their `run.json`."""
-    frame = pd.DataFrame(record["config"] | record for record in records)
-    frame = frame[["environment", "variant", "seed", "seconds", "peak_memory_mb"]]
-    frame = frame.rename(columns={"environment": "env"})
-    frame = frame.merge(runs[["env", "variant", "seed", "env_steps"]], validate="1:1")
-    rows = []
-    for (env, variant), own in frame.groupby(["env", "variant"], sort=False):
-        row = [env, labels[str(variant)], number(len(own)), number(own["env_steps"].sum() / 1000)]
-        row += [duration(own["seconds"].agg(what)) for what in ("median", "max", "sum")]
-        rows.append([*row, number(own["peak_memory_mb"].max())])
-    heads = ["environment", "variant", "runs", "steps, thousands", "a run, median", "longest"]
-    return pd.DataFrame(rows, columns=[*heads, "together", "memory, MB"])
 
 
 def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
