@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from invented import CONFIG, averages, curve, frame, noisy
 
-from mace_rl.training.records import read_table
+from mace_rl.base.tables import read_table
 from mace_study.measure import betas as b
 
 

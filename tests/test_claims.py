@@ -24,8 +24,8 @@ from invented import (
 )
 from shared import refused
 
+from mace_rl.base.tables import RecordError
 from mace_rl.config.section import ConfigError
-from mace_rl.training.records import RecordError
 from mace_study.compare import verdicts
 from mace_study.compare.claims_config import parts_of, read_claims
 from mace_study.compare.ledger import Finding, read_ledger, to_json

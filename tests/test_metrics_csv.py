@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from invented import CONFIG, SETTINGS, frame, noisy
 
+from mace_rl.base.tables import RecordError
 from mace_rl.config.section import ConfigError, check
-from mace_rl.training.records import RecordError
 from mace_study.config.metrics import GOALS, MetricsConfig
 from mace_study.measure import metrics as m
 from mace_study.measure.metrics_csv import metrics_of_run, metrics_table, read_metrics

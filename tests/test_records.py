@@ -9,7 +9,8 @@ import pytest
 from invented import episode_columns
 from shared import refused
 
-from mace_rl.training.records import RecordError, read_episodes, write_episodes
+from mace_rl.base.tables import RecordError
+from mace_rl.training.records import read_episodes, write_episodes
 
 HEADER = "episode,env_steps,length,extrinsic_return,intrinsic_return,beta,terminated"
 ROWS = ["1,10,10,9.5,0.25,0.4,1", "2,30,20,-19.0,3e-05,0.3996,0", "3,31,1,0.1,0.0,0.0,1"]

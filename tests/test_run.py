@@ -38,11 +38,11 @@ from shared import (
 
 from mace_rl.base import code_digest
 from mace_rl.base.files import LOCK
+from mace_rl.base.tables import RecordError
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import hopper
 from mace_rl.runs import checkpoint, provenance, run
 from mace_rl.runs.finished import read_runs
-from mace_rl.training.records import RecordError
 from mace_rl.training.trainer import Trainer
 
 

@@ -14,6 +14,7 @@ import torch
 from shared import GOOD, LAYER_NORM, call, refusal, refused
 
 from mace_rl.base import files
+from mace_rl.base.tables import RecordError
 from mace_rl.beta.controller import BetaController
 from mace_rl.config.plugins import code_outside, make
 from mace_rl.config.section import ConfigError
@@ -22,7 +23,7 @@ from mace_rl.runs.agent import load_agent
 from mace_rl.runs.checkpoint import CheckpointError, archive
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import file_digest
-from mace_rl.training.records import EpisodeRecord, RecordError
+from mace_rl.training.records import EpisodeRecord
 
 PAGER = {"kind": "custom", "rule": "pydoc:pipepager", "arguments": {"cmd": "touch ran"}}
 NETWORK = {"kind": "torch", "module": "pydoc:pipepager"}

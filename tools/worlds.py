@@ -17,7 +17,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from mace_rl.base.errors import Refusal
-from mace_rl.training.records import RecordError
+from mace_rl.base.tables import RecordError
 from mace_study.compare.claims_config import LEARNED, read_claims
 from mace_study.compare.ledger import read_ledger
 from mace_study.compare.single_seeds import draw, numbers

@@ -20,13 +20,14 @@ import yaml
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
+from mace_rl.base.tables import RecordError
 from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import IDENTITY
 from mace_rl.config.section import ConfigError, check
 from mace_rl.run_settings import check_name
 from mace_rl.runs import provenance
 from mace_rl.runs.finished import FinishedRun
-from mace_rl.training.records import EpisodeRecord, RecordError, as_columns, write_episodes
+from mace_rl.training.records import EpisodeRecord, as_columns, write_episodes
 
 STUDY = "study.yaml"  # in the folder of results: what the workflow is to do with it
 MONITORS = "*monitor.csv"

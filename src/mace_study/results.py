@@ -11,8 +11,9 @@ from typing import Any
 import pandas as pd
 
 from mace_rl.base.files import write_atomically
+from mace_rl.base.tables import read_table
 from mace_rl.config.agent import PPOConfig
-from mace_rl.training.records import RunKey, read_table
+from mace_rl.training.records import RunKey
 from mace_study.compare import ledger, verdicts
 from mace_study.compare.aggregate import aggregate
 from mace_study.compare.claims_config import ClaimsConfig

@@ -10,9 +10,9 @@ import pandas as pd
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
+from mace_rl.base.tables import RecordError
 from mace_rl.runs import checkpoint
 from mace_rl.runs.finished import NEVER_WRITTEN, FinishedRun
-from mace_rl.training.records import RecordError
 
 
 def write_all(folder: Path, out: Path) -> int:

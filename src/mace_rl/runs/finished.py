@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from mace_rl.base import code_digest, files
+from mace_rl.base.tables import ALTERED, RecordError
 from mace_rl.config.plugins import code_outside, load
 from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.runs.provenance import difference, identity, read_record
 from mace_rl.training.records import (
-    ALTERED,
     EpisodeRecord,
-    RecordError,
     RunKey,
     as_columns,
     check_episodes,

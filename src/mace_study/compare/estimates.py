@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from mace_rl.training.records import RecordError
+from mace_rl.base.tables import RecordError
 from mace_study.compare.claims_config import Part
 from mace_study.compare.ledger import Finding
 from mace_study.compare.statistics import (

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from mace_rl.training.records import RecordError
+from mace_rl.base.tables import RecordError
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from mace_rl.base.tables import RecordError, read_table
 from mace_rl.config.section import ConfigError
-from mace_rl.training.records import RecordError, RunKey, read_table
+from mace_rl.training.records import RunKey
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.metrics import (
     Attained,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from mace_rl.training.records import read_table
+from mace_rl.base.tables import read_table
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
 from mace_study.compare.comparisons import ALL
 from mace_study.compare.ledger import Answer, read_ledger
