@@ -1,7 +1,7 @@
 """Labels as LaTeX: what they may have in them, and which packages that needs.
 
 pylatexenc has the table of Unicode and LaTeX; here is which of it pdflatex sets with the packages
-that papers load anyway, tried character by character (tests/test_labels.py).
+that papers load anyway, tried character by character (tests/study/test_labels.py).
 """
 
 import re

@@ -18,7 +18,7 @@ from scipy import stats
 
 from tools import kept_runs
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TABLES = ROOT / "reference" / "tables"
 STUDIES = yaml.safe_load((ROOT / "reference" / "studies.yaml").read_text(encoding="utf-8"))
 CLAIMS = yaml.safe_load((ROOT / "config" / "claims.yaml").read_text(encoding="utf-8"))

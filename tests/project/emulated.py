@@ -1,4 +1,4 @@
-"""What tests/test_cross_cpu.py lets a processor do: `python emulated.py TASKS`, a JSON list.
+"""What test_cross_cpu.py lets a processor do: `python emulated.py TASKS`, a JSON list.
 
 One process for all tasks: emulated, importing and compiling take minutes. A task is an environment,
 a variant, a folder and whether to stop half way; or "tables" and a folder.
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 # More than the 10 updates after which a β has its credit.
 EPISODES = {"Acrobot-v1": 14, "CartPole-v1": 60, "HopperBulletEnv-v0": 60}
 # So small that memory and buffer are full before the end, and what is in them is replaced.
@@ -47,15 +47,22 @@ def train(environment: str, variant: str, folder: str, halt: bool) -> None:
 
 
 def tabulate(folder: str) -> None:
-    """Make `TABLES`, as the workflow does, in processes forked from this one."""
-    from tools import tables
+    """Make `TABLES` of the runs in reference/runs, as the workflow's jobs do."""
+    from mace_rl.runs.finished import read_runs
+    from mace_study import results
+    from mace_study.config.study import read_study
+    from mace_study.plan import Plan
 
     os.chdir(ROOT)
-    tables.MADE = Path(folder)
-    tables.MADE.mkdir()
-    (tables.MADE / "runs").symlink_to(ROOT / "reference" / "runs")
-    study = {"configfiles": ["config/reference.yaml"], "config": [], "outputs": TABLES}
-    tables.make_all({"reference": study})
+    study = read_study([Path("config.yaml"), Path("config/reference.yaml")])  # results: reference
+    plan, goal = Plan(study, ROOT), Path(folder)
+    goal.mkdir()
+    records = [f"{run}/run.json" for run in plan.folders]
+    frames = read_runs(records, plan.with_episodes, plan.run_settings)
+    own = plan.with_episodes, plan.measured, plan.paper
+    results.measure(frames, plan.measured, goal, ["figure1"], None)
+    results.tabulate(goal, *own, study.labels)
+    results.draw(goal, ["figure1"], *own, plan.style, judged=False)
 
 
 if __name__ == "__main__":

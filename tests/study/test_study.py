@@ -22,7 +22,7 @@ from mace_rl.config.section import ConfigError, check
 from mace_study.compare.claims_config import read_claims
 from mace_study.config.study import LABEL, load_study, read_study
 
-CONFIG = Path(__file__).parents[1] / "config.yaml"
+CONFIG = Path(__file__).parents[2] / "config.yaml"
 RULES = CONFIG.parent / "workflow" / "rules"
 PLAIN = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
 

@@ -24,7 +24,7 @@ from mace_rl.runs.verify import repeat
 from mace_rl.training.experience import Rollout
 from mace_rl.training.trainer import Trainer
 
-CONFIG = Path(__file__).parents[1] / "config"
+CONFIG = Path(__file__).parents[2] / "config"
 BOX = "MountainCarContinuous-v0"  # which has actions beyond their bounds cost something
 SHARED = ("normalise_returns", "clip_actions")  # settings of ppo
 

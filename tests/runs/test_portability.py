@@ -18,7 +18,7 @@ from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import curves
 from mace_study.show.latex import table1_latex
 
-PRODUCTS = f"{Path(__file__).with_name('test_matmul.py')}::test_every_element_is_one_chain"
+PRODUCTS = f"{ROOT / 'tests' / 'numerics' / 'test_matmul.py'}::test_every_element_is_one_chain"
 HAS_AVX512 = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
 STRANGE = {"PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
 STRANGE |= {"LC_ALL": "C", "LANG": "tr_TR.UTF-8", "TZ": "Asia/Kathmandu"}

@@ -2,7 +2,7 @@
 
 Each environment and variant of the paper is trained undisturbed; then a training is killed
 (SIGKILL) at a random moment, while it writes a checkpoint, and while it writes its results, and the
-same command is given again. tests/test_workflow.py does it to a workflow.
+same command is given again. tests/workflow/test_workflow.py does it to a workflow.
 """
 
 import os
