@@ -28,7 +28,7 @@ PYTEST := $(IN_VENV) pytest -n $(if $(filter all,$(CORES)),auto,$(CORES)) --maxp
 one_of = $(if $(filter-out $(2),$($(1))),$(error $(1) is '$($(1))', but should be $(2) or not be given))
 
 .DEFAULT_GOAL := all
-.PHONY: all quick test test-quick test-wheel tables bench verify cross-cpu kill-test slurm-test archive image-test lint lock audit clean help setup
+.PHONY: all quick test test-quick test-wheel tables bench verify cross-cpu kill-test slurm-test image-test lint lock audit clean help setup
 
 all: setup ## the paper's study: every run, table and figure, at the paper's budgets (hours)
 	@$(SNAKEMAKE) all
@@ -73,9 +73,6 @@ slurm-test: setup ## the reduced study on a Slurm cluster of one node, compared 
 
 image-test: ## build Containerfile's image with buildah and run it without network, as root (minutes)
 	@.ci/image
-
-archive: setup ## the committed tree with checksums as dist/mace-rl-VERSION.tar, for a DOI
-	@$(IN_VENV) tools.deposit
 
 lint: setup ## check style, types and workflow
 	@$(IN_VENV) ruff check --no-cache . # an import's place depends on files that a cache does not look at

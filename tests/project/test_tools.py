@@ -19,7 +19,6 @@ from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.runs import run
 from mace_study.config.study import read_study
 from tools import kept_runs, random_return, schema, tables, worlds
-from tools.deposit import DepositError, deposit
 
 
 def test_editors_are_told_what_a_configuration_may_be() -> None:
@@ -191,57 +190,3 @@ def test_a_random_return_is_that_of_random_actions(monkeypatch, capsys, register
         error = (steps / 4 / 40) ** 0.5
         assert words[0] == name and float(words[1]) == pytest.approx(steps / 2, abs=4 * error)
         assert float(words[-1]) == pytest.approx(error, rel=0.4)
-
-
-# --- deposit --------------------------------------------------------------------------------------
-
-of_a_clone = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="only a clone is deposited")
-
-
-def printed(*command: str | Path, cwd: Path) -> str:
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True).stdout
-
-
-@pytest.fixture
-def clone(tmp_path: Path) -> Path:
-    printed("git", "clone", "-q", ROOT, tmp_path / "clone", cwd=tmp_path)
-    return tmp_path / "clone"
-
-
-@of_a_clone
-@pytest.mark.slow
-def test_the_archive_is_the_commit_and_its_checksums_hold(clone, tmp_path):
-    name, data = deposit(clone)
-    (tmp_path / name).write_bytes(data)
-    printed("tar", "-xf", name, cwd=tmp_path)
-    folder = tmp_path / name.removesuffix(".tar")
-    printed("sha256sum", "--check", "--quiet", "--strict", "SHA256SUMS", cwd=folder)
-    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    tracked = printed("git", "ls-files", "-z", cwd=clone).split("\0")[:-1]
-    assert files == {*tracked, "SHA256SUMS"}
-    assert {"environment.lock", "LICENSE", "reference/README.md"} <= files
-    assert all((folder / path).read_bytes() == (clone / path).read_bytes() for path in tracked)
-    assert (folder / ".ci/run").stat().st_mode & 0o111
-    assert (folder / "src/mace_rl/config/defaults.yaml").is_symlink()
-    with (tmp_path / name).open("rb") as file:
-        said = subprocess.run(["git", "get-tar-commit-id"], stdin=file, capture_output=True)
-    assert said.stdout.decode() == printed("git", "rev-parse", "HEAD", cwd=clone)
-
-
-@of_a_clone
-@pytest.mark.slow
-def test_equal_bytes_again_from_another_clone(clone, tmp_path):
-    printed("git", "clone", "-q", clone, tmp_path / "a second clöne", cwd=tmp_path)
-    for path in (tmp_path / "a second clöne").rglob("*.py"):
-        path.touch()
-        path.chmod(0o600)
-    assert deposit(tmp_path / "a second clöne") == deposit(clone) == deposit(clone)
-
-
-@of_a_clone
-@pytest.mark.slow
-@pytest.mark.parametrize("change", ["README.md", "a new file"])
-def test_what_is_not_committed_is_refused(clone, change):
-    (clone / change).write_text("changed")
-    with pytest.raises(DepositError, match=rf"^not committed: .*{change}\W*$"):
-        deposit(clone)
