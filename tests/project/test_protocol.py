@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,14 @@ from mace_rl.base import files
 from mace_rl.config.plugins import load
 from mace_rl.config.run import RunConfig
 from mace_study.config.study import Study, read_study
-from tools import kept_runs
+from tools import kept_runs, specification
 
 # By the commit that runs name: their protocol as it lies there, and where it lies today.
 PROTOCOLS = {
     "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
     "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
+    "08d9a0b": ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
 }
 WORLDS = {  # what is read over config.yaml
     "tuned": ["worlds/tuned"],
@@ -51,6 +53,10 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
     names = TASKS if folder == "tasks" else [folder]
     own = {"mace_lstm", "mace_credit", "mace_pretrained_no_memory"}  # asked by the first alone
     asked = {run for name in names for run in world(name).runs()}
+    for place, seeds in specification.WORLDS.values():
+        if place == folder:
+            cells = product(seeds, specification.READINGS)
+            asked |= {(env, name, seed) for env, name in cells for seed in seeds[env]}
     assert {run for run in records if run[1] not in own} <= asked
     git, told = ["git", "-C", str(ROOT)], {"capture_output": True}
     shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
