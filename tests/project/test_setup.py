@@ -60,8 +60,8 @@ def test_setup_installs_only_what_is_pinned_then_does_and_says_nothing(checkout)
     assert (code, said.count("\n")) == (0, 1)
     installs = [call for call in calls if "pip install" in call]
     assert all("--no-deps" in call and "--no-build-isolation" in call for call in installs)
-    assert ["--require-hashes" in call for call in installs] == [True, True, True, False]
-    assert installs[2].endswith("-r environment.lock")
+    assert ["--require-hashes" in call for call in installs] == [True, True, True, True, False]
+    assert installs[3].startswith("-m uv") and installs[3].endswith("-r environment.lock")
     for path in checkout.iterdir():
         os.utime(path, (1e9, 1e9))  # a clone or a copy changes time stamps, not contents
     assert make(checkout, PYTHON="not asked for") == (0, "", [])
