@@ -96,11 +96,12 @@ def make(archives: Path, goal: Path, cores: int) -> list[str]:
     if not found:
         return []
     answers = pd.concat(found, ignore_index=True)
+    shown = [name for name in READINGS if name in set(answers["reading"])]
     goal.mkdir(parents=True, exist_ok=True)
     answers.to_csv(goal / "specification.csv", index=False)
     betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
     betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
-    save_figure(worlds.draw_specification(answers), goal / "specification.png")
+    save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
     text = page("readings", ORIGIN, sections(answers, betas), ["specification"])
     (goal / "README.md").write_text(text, encoding="utf-8")
     return ["specification.csv", "deviations.csv", "specification.png", "README.md"]
@@ -116,9 +117,10 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
         said = own["verdict"].where(own["whole"], own["verdict"] + " †")
         wide = own.assign(verdict=said).pivot(index="claim", columns="reading", values="verdict")
         order = own[["claim", "statement"]].drop_duplicates("claim")
-        wide = wide[list(own["reading"].unique())].fillna("").reset_index()
+        wide = wide[[name for name in READINGS if name in wide]].fillna("").reset_index()
         same = shared(own).rename("as the default")
-        frame = order.merge(wide).merge(same, left_on="claim", right_index=True)
+        frame = order.merge(wide).merge(same, "left", left_on="claim", right_index=True).fillna("")
+        frame = frame.sort_values("claim", key=lambda names: names.str[1:].astype(int))
         note = (
             "†: the claim is about Hopper, too, whose runs are of the default alone; asked of the"
             f" other environments, and not counted. *As the default*: readings with {DEFAULT}'s"
@@ -129,7 +131,8 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
         "Median over trainings of the standard deviation of the β that the network asks for,"
         f" without what a reading adds to learn by. Above {MOVES} β moves."
     )
-    frame = betas.set_index("reading").map("{:.3f}".format).reset_index()
+    frame = betas.set_index("reading").map("{:.3f}".format, na_action="ignore").fillna("–")
+    frame = frame.reset_index()
     return [*found, Section("How much β moves", note, frame)]
 
 

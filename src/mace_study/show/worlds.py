@@ -101,8 +101,8 @@ def draw_verdicts(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def draw_specification(table: pd.DataFrame) -> Figure:
-    """A cell per claim and reading in the colour of what came out, a panel per world.
+def draw_specification(table: pd.DataFrame, readings: Sequence[str]) -> Figure:
+    """A cell per claim and of these readings in the colour of what came out, a panel per world.
 
     table: of `mace_study.compare.specification`, with the column world. Pale: a claim that is cut
     to the environments that are there.
@@ -111,21 +111,22 @@ def draw_specification(table: pd.DataFrame) -> Figure:
     claims = claims.iloc[claims["claim"].str[1:].astype(int).argsort()]
     named = zip(claims["claim"], claims["statement"], strict=True)
     said = {claim: wrapped(f"{claim} {statement}", 44) for claim, statement in named}
-    readings, groups = list(table["reading"].unique()), table.groupby("world", sort=False)
+    groups = table.groupby("world", sort=False)
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
     with style():
-        figure, panels = grid(groups.ngroups, groups.ngroups, height=LINE * (3 * len(said) + 8))
+        figure, panels = grid(groups.ngroups, groups.ngroups, height=LINE * (2.4 * len(said) + 8))
         for (world, own), axes in zip(groups, panels, strict=True):
             rows: Any = own.itertuples()
             for row in rows:
                 left, top = readings.index(row.reading), list(said).index(row.claim)
                 colour, label = OUTCOMES.get(row.outcome, ("#ffffff", "not asked: β does not move"))
                 area = (left + 0.04, left + 0.96), (top + 0.06,) * 2, (top + 0.94,) * 2
-                edge: dict[str, Any] = {"edgecolor": "#b0b0b0", "linewidth": 0.4, "label": label}
-                axes.fill_between(*area, color=colour, alpha=0.75 if row.whole else 0.2, **edge)
+                look: dict[str, Any] = {"color": colour, "edgecolor": "#b0b0b0", "linewidth": 0.4}
+                axes.fill_between(*area, alpha=0.75 if row.whole else 0.2, **look)
+                axes.fill_between([0], [0], alpha=0.75, label=label, **look)  # for the legend
             axes.set(xlim=(0, len(readings)), ylim=(len(said), 0), title=str(world))
             names = [name.removeprefix("mace_").replace("_", "\n") for name in readings]
-            axes.set_xticks(np.arange(len(readings)) + 0.5, names, rotation=90, **small)
+            axes.set_xticks(np.arange(len(readings)) + 0.5, names, rotation=90, fontsize="x-small")
             axes.set_yticks(np.arange(len(said)) + 0.5, list(said.values()), **small)
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
