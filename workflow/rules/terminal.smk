@@ -6,9 +6,8 @@ import textwrap
 
 from snakemake.logging import LogEvent, logger
 
-# What Snakemake lacks (9.27.1): when it is killed its jobs go on, unseen and in the way of the next
-# one's. So they end with it: workflow/scripts/job.py. On a cluster that is the Snakemake on the
-# node, which reads this too, and not the one that submitted.
+# When Snakemake 9.27.1 is killed its jobs go on, so they end with it: workflow/scripts/job.py. On a
+# cluster that is the Snakemake on the node, which reads this too, and not the one that submitted.
 os.environ.update(MACE_RL_SNAKEMAKE_PID=str(os.getpid()))
 # There several runs share a job. If that ends in the middle, Snakemake deletes the results of those
 # that were done, too, and they come back from their last checkpoints.
@@ -19,8 +18,7 @@ if workflow.remote_exec:
 def occupy(folder):
     """Keep other Snakemakes out of `folder` as long as this process lives.
 
-    What Snakemake lacks (9.27.1): its own lock outlives a kill, and the same command is then refused
-    until `--unlock`. So profiles/default/config.yaml turns it off.
+    Snakemake's own lock (9.27.1) outlives a kill; profiles/default/config.yaml turns it off.
     """
     try:
         os.makedirs(folder, exist_ok=True)
@@ -40,9 +38,8 @@ def occupy(folder):
 def in_short(record):
     """Let Snakemake say in a line which job begins, and why one failed.
 
-    What it lacks (9.27.1): it lists all inputs and outputs of a job, some thousand files for the
-    metrics of a study, or with `quiet: rules` not even the jobs that failed; and of a failed script
-    it says that there is a log, not what is in it.
+    Snakemake 9.27.1 lists all inputs of a job, thousands for a study's metrics, or with `quiet:
+    rules` not even failures; and of a failed script it does not say what its log has.
     """
     event = getattr(record, "event", None)
     if event == LogEvent.JOB_INFO and not workflow.dryrun:

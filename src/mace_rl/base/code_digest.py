@@ -1,8 +1,7 @@
 """The content of the source files that a result depends on, as one digest.
 
-What Snakemake lacks (9.27.1): it looks into scripts but not into what they import, so after an edit
-of `src/mace_rl/agent/ppo.py` it has "Nothing to be done". Of a declared input it records the
-content when the job *ended*. So the workflow gives each job the digest at planning.
+Snakemake 9.27.1 looks into scripts but not into what they import, and records of an input what it
+contained when the job *ended*. So the workflow gives each job the digest at planning.
 """
 
 import ast

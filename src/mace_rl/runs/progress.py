@@ -1,7 +1,6 @@
 """How far trainings are and when they will be done: `mace-rl train`, and `mace-rl status`.
 
-What Snakemake lacks (9.27.1; snakemake-logger-plugin-rich 0.5.1 too): it counts jobs, not the
-episodes within them, and does not estimate the time left, for which environments differ.
+Snakemake 9.27.1 counts jobs, not the episodes within them, and estimates no time left.
 """
 
 import fcntl
