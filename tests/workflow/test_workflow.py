@@ -267,7 +267,6 @@ def test_runs_from_elsewhere_are_taken_if_they_are_this_study_s(finished: Projec
     shutil.copytree(finished["results/runs"], finished["copied/runs"])
     code, output = finished("snakemake copied/tables.md --config results=copied")
     assert code == 0 and "train" not in re.findall(r"^(\w+) +\d", output, re.MULTILINE), output
-    assert output.splitlines()[-1].endswith("copied/tables.md")
     shutil.rmtree(finished["copied/runs"])
     shutil.copytree(finished["results/runs"], finished["other/runs"])
     changed = "results=other 'training={ppo: {clip: 0.3}}'"
