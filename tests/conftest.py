@@ -36,7 +36,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class ByStudy(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = nodeid.partition("::")[0]
-            return file if Path(file).name in ("test_workflow.py", "test_report.py") else nodeid
+            return file if Path(file).name == "test_workflow.py" else nodeid
 
     return ByStudy(config, log)
 
