@@ -6,12 +6,15 @@ their means over the seeds and the differences, with 95 % intervals; and β over
 
 import argparse
 import sys
+from typing import Any
 
 import mace_rl.base.cpu_features  # noqa: F401  # isort: skip  (before NumPy: equal bits on every processor)
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import FlattenObservation
+from minigrid.wrappers import ImgObsWrapper  # registers MiniGrid, too
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
@@ -42,9 +45,11 @@ def train(
     beta: None for PPO alone.
     """
     monitor = Monitor(gymnasium.make(environment))  # inside, so that it sees extrinsic rewards
-    env = monitor
+    env: gymnasium.Env[Any, Any] = monitor
     if beta is not None:
         env = CuriosityReward(monitor, beta, centred=centred, seed=seed)
+    if environment.startswith("MiniGrid-"):  # whose policy reads the image, flattened
+        env = FlattenObservation(ImgObsWrapper(env))
     agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=seed, device="cpu")
     betas = Betas()
     agent.learn(steps, callback=betas)

@@ -15,6 +15,7 @@ import pandas as pd
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
+from mace_study.compare.comparisons import ALL, comparisons
 from mace_study.compare.specification import MOVES, asked_beta, specification
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
@@ -86,12 +87,15 @@ def asked(
 def make(archives: Path, goal: Path, cores: int) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
     study = read_study([ROOT / "config.yaml"])
-    found, moved = [], {}
+    found, compared, moved = [], [], {}
     for world, (place, seeds) in WORLDS.items():
         if (archives / place).exists():
             table, deviations = asked(archives / place, seeds, study.metrics, cores)
             own = specification(table, study.metrics, ROOT / study.claims, deviations, DECIDES)
             found.append(own.assign(world=world))
+            pairs = [[name, other] for name in deviations for other in BASELINES]
+            own = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
+            compared.append(own[own["env"] != ALL].assign(world=world))
             moved[world] = deviations
     if not found:
         return []
@@ -99,12 +103,14 @@ def make(archives: Path, goal: Path, cores: int) -> list[str]:
     shown = [name for name in READINGS if name in set(answers["reading"])]
     goal.mkdir(parents=True, exist_ok=True)
     answers.to_csv(goal / "specification.csv", index=False)
+    pd.concat(compared).to_csv(goal / "comparisons.csv", index=False)
     betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
     betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
     save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
     text = page("readings", ORIGIN, sections(answers, betas), ["specification"])
     (goal / "README.md").write_text(text, encoding="utf-8")
-    return ["specification.csv", "deviations.csv", "specification.png", "README.md"]
+    names = ("specification.csv", "comparisons.csv", "deviations.csv", "specification.png")
+    return [*names, "README.md"]
 
 
 ORIGIN = "By `make tables`, from the runs of [the protocol](../../readings/protocol.md)."

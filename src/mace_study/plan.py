@@ -58,7 +58,8 @@ class Plan:
     @cached_property
     def run_settings(self) -> dict[tuple[str, str], dict[str, Any]]:
         """By environment and variant the settings of its runs, whatever the seed."""
-        return {run[:2]: self.study.settings_of(*run[:2]) for run in self.runs}
+        pairs = dict.fromkeys(run[:2] for run in self.runs)
+        return {pair: self.study.settings_of(*pair) for pair in pairs}
 
     @cached_property
     def with_episodes(self) -> list[tuple[str, str, int, int]]:
@@ -142,9 +143,11 @@ class Plan:
         """What cannot be said of this study, in a line each; known: Gymnasium's registry."""
         study = self.study
         lines = study.metrics.incomplete(study.environments, study.variants)
-        for episodes in sorted({episodes for *_, episodes in self.with_episodes}):
-            if short := out_of_reach(self.measured, episodes):
-                lines.append(f"{episodes} episodes are too few for {', '.join(short)}")
+        budgets = sorted({episodes for *_, episodes in self.with_episodes})
+        short = {tuple(out_of_reach(self.measured, episodes)): episodes for episodes in budgets}
+        for names, episodes in short.items():
+            if names:
+                lines.append(f"{episodes} episodes are too few for {', '.join(names)}")
         for title, lacking in {} if self.judged else self.lacking.items():
             if not set(lacking).intersection(known):  # about environments that it has
                 lines.append(

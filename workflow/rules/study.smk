@@ -50,15 +50,11 @@ RECORDS = [f"{run}/{files.RECORD}" for run in plan.folders]
 MEASURED = ("metrics", "betas", "readings")
 
 
-def command(*words, options=options):
-    """Snakemake's, for this study."""
-    found = ["snakemake", *words]
-    found += ["--configfile", *config_files[1:]] if config_files[1:] else []
-    return shlex.join([*found, "--config", *options] if options else found)
-
-
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.
-COMMAND = command("all", options=[one for one in options if not one.startswith("results=")])
+COMMAND = ["snakemake", "all", *(["--configfile", *config_files[1:]] if config_files[1:] else [])]
+if changed := [option for option in options if not option.startswith("results=")]:
+    COMMAND += ["--config", *changed]
+COMMAND = shlex.join(COMMAND)
 
 
 def shown(file, caption, category="Results"):

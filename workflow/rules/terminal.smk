@@ -145,7 +145,7 @@ onstart:
     for line in plan.remarks(registered()):
         logger.info(line)
     due, runs = sum(run["due"] for run in planned["runs"]), len(planned["runs"])
-    if workflow.executor_plugin.name != "touch":
+    if runs and workflow.executor_plugin.name != "touch":
         to_train = f"{due} of {runs} runs to train"
         logger.info(f"{to_train}; how far they are: mace-rl status {RESULTS}")
 
