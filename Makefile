@@ -45,7 +45,7 @@ test-quick: setup ## the tests that take seconds, for the edit loop
 test-wheel: setup ## the wheel in environments of its own: newest, lowest, Debian 13 (minutes)
 	@.ci/wheel
 
-tables: setup ## the tables, figures and verdicts of reference/studies.yaml from its runs, without training
+tables: setup ## the tables, figures and verdicts of the studies that are kept, without training
 	@$(IN_VENV) tools.tables --cores $(CORES) $(if $(CI),--check)
 
 bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a change slower? (minutes)
@@ -54,12 +54,9 @@ bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a chan
 
 verify: setup ## repeat some of the twelve short runs, one each of tuned, plain, our tasks, MiniGrid: to the bit (SAMPLE=3)
 	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
-	folder=$$(mktemp -d)
-	trap 'rm -rf "$$folder"' EXIT
-	for world in $(wildcard reference/worlds/tuned reference/worlds/plain reference/worlds/tasks reference/worlds/minigrid); do
-	    $(IN_VENV) tools.kept_runs unpack "$$world" "$$folder/$${world##*/}" --sample 1 >/dev/null
+	for world in tuned plain tasks minigrid; do
+	    $(IN_VENV) tools.kept_runs verify reference/worlds/$$world --sample 1
 	done
-	$(IN_VENV) mace_rl.cli verify "$$folder" --trust # a rule for β is of extras/
 
 cross-cpu: setup ## train under emulated processors and compare to the bit (half an hour; CROSS=short)
 	@$(call one_of,CROSS,short)

@@ -32,7 +32,7 @@ FIRST, _, *OTHERS = CLAIMS.families.items()  # the second has metrics of its own
 PAPERS, QUESTIONS = (CLAIMS.model_copy(update={"families": dict(own)}) for own in ([FIRST], OTHERS))
 LITERAL, ROBUST = CLAIMS.ways
 ENVIRONMENTS, VARIANTS = STUDY.environments, STUDY.variants
-ASKED = ("questions", "controls", "planted", "minigrid")
+ASKED = ("tasks", "planted", "minigrid")
 ASKED = [ROOT / "config" / f"{name}.yaml" for name in ASKED]
 QUESTIONED = read_study([ROOT / "config.yaml", *ASKED]).metrics
 FEW = {"bootstrap_repetitions": 1000}

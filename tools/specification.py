@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # By world the folder that its runs are in, and the seeds of each environment.
 WORLDS = {
     "tuned": ("tuned", dict.fromkeys(("Acrobot-v1", "CartPole-v1"), range(200, 240))),
-    "plain": ("decided", {"Acrobot-v1": range(300, 500), "CartPole-v1": range(300, 400)}),
+    "plain": ("plain", {"Acrobot-v1": range(300, 500), "CartPole-v1": range(300, 400)}),
 }
 BASELINES = ("ppo", "mace_fixed")
 DEFAULT = "mace_full"
@@ -43,34 +43,35 @@ DECIDES = "robust"
 
 
 def measured(
-    archive: Path, seeds: range, settings: MetricsConfig
+    path: Path, variant: str, seeds: range, settings: MetricsConfig
 ) -> tuple[pd.DataFrame, list[float]] | None:
     """Rows of metrics.csv and betas.csv of a variant's runs, and how far each asked β deviates.
 
     None where runs are lacking.
     """
-    there = kept_runs.runs_of(archive) if archive.exists() else {}
-    if not {*seeds} <= {*there}:
+    there = kept_runs.read(path, [variant])
+    if not {(variant, seed) for seed in seeds} <= {*there}:
         return None
     frames, moved = {}, []
     for seed in seeds:
-        frame, own = kept_runs.frame(there[seed]), json.loads(there[seed].record)["config"]
-        frames[own["environment"], own["variant"], seed] = frame
-        if own["variant"] not in BASELINES:
-            config = RunConfig.model_validate(own)
+        record, frame = there[variant, seed]
+        config = RunConfig.model_validate(json.loads(record)["config"])
+        frames[config.environment, variant, seed] = frame
+        if variant not in BASELINES:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     both = metrics_table(frames, settings), betas_table(frames, settings)
     return both[0].merge(both[1], on=["env", "variant", "seed"]), moved
 
 
 def asked(
-    archives: Path, seeds: Mapping[str, range], settings: MetricsConfig, cores: int
+    folder: Path, seeds: Mapping[str, range], settings: MetricsConfig, cores: int
 ) -> tuple[pd.DataFrame, dict[str, float]]:
     """The runs of one world, and of each reading that is complete there how much its β moves."""
     jobs = [(name, env) for name in (*BASELINES, *READINGS) for env in seeds]
-    places = [archives / files.folder_of(env) / f"{name}.tar.xz" for name, env in jobs]
+    paths = [folder / f"{files.folder_of(env)}.parquet" for _, env in jobs]
+    variants, ranges = zip(*((name, seeds[env]) for name, env in jobs), strict=True)
     with ProcessPoolExecutor(cores) as pool:
-        made = pool.map(measured, places, (seeds[env] for _, env in jobs), repeat(settings))
+        made = pool.map(measured, paths, variants, ranges, repeat(settings))
         found = dict(zip(jobs, made, strict=True))
     whole = {
         name: [part for env in seeds if (part := found[name, env]) is not None]
@@ -78,19 +79,19 @@ def asked(
     }
     whole = {name: own for name, own in whole.items() if len(own) == len(seeds)}
     if lacking := [name for name in BASELINES if name not in whole]:
-        raise Refusal(f"{archives} lacks runs of {', '.join(lacking)}")
+        raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
     table = pd.concat([rows for own in whole.values() for rows, _ in own], ignore_index=True)
     moved = {name: [one for _, runs in own for one in runs] for name, own in whole.items()}
     return table, {name: statistics.median(moved[name]) for name in READINGS if name in whole}
 
 
-def make(archives: Path, goal: Path, cores: int) -> list[str]:
+def make(kept: Path, goal: Path, cores: int) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
     study = read_study([ROOT / "config.yaml"])
     found, compared, moved = [], [], {}
     for world, (place, seeds) in WORLDS.items():
-        if (archives / place).exists():
-            table, deviations = asked(archives / place, seeds, study.metrics, cores)
+        if (kept / place).exists():
+            table, deviations = asked(kept / place, seeds, study.metrics, cores)
             own = specification(table, study.metrics, ROOT / study.claims, deviations, DECIDES)
             found.append(own.assign(world=world))
             pairs = [[name, other] for name in deviations for other in BASELINES]

@@ -2,13 +2,12 @@
 
     python -m tools.tables [--check] [--cores N]        (make tables)
 
-Of the kept runs are made, in results/tables/STUDY, the outputs that reference/studies.yaml names,
-by the functions that the workflow's rules call, and README.md: tables.md with the pictures that are
-among these. What the worlds of reference/worlds/protocol.md say together comes into
-results/tables/worlds, and what they say of every reading of the learned β into
-results/tables/readings. Pictures are reduced to 256 colours. All is compared with reference/tables.
-New files are kept there, and README.md, which only shows the others, is renewed; with --check both
-are mistakes.
+Of the kept runs of each of `STUDIES` are made, in results/tables/STUDY, its tables and pictures, by
+the functions that the workflow's rules call, and README.md: tables.md with these pictures. What the
+worlds of reference/worlds/protocol.md say together comes into results/tables/worlds, and what they
+say of every reading of the learned β into results/tables/readings. Pictures are reduced to 256
+colours. All is compared with reference/tables. New files are kept there, and README.md, which only
+shows the others, is renewed; with --check both are mistakes.
 """
 
 import argparse
@@ -30,7 +29,7 @@ from PIL import Image
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
-from mace_rl.config.reading import merge, read_options, read_yaml
+from mace_rl.config.reading import merge, read_yaml
 from mace_rl.runs.finished import require_settings
 from mace_rl.training.records import RunKey
 from mace_study import results
@@ -40,78 +39,87 @@ from tools import kept_runs, specification, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 
-STUDIES = Path("reference/studies.yaml")
+# The files in config/ of each study whose runs are kept, over config.yaml. The longest come first.
+STUDIES = {
+    "tasks": ("tasks",),
+    "plain": ("plain",),
+    "minigrid": ("tasks", "minigrid"),
+    "tuned": ("tuned",),
+    "planted": ("tasks", "planted"),
+    "published": ("published",),
+    "initial": ("plain", "initial"),
+}
+KEPT = Path("reference/worlds")
+ELSEWHERE = {"initial": "plain"}  # whose folder of `KEPT` has its runs, if not its own
+OF_PAPERS = ("betas.csv", "table1.csv", "table1.tex", "readings.csv", "readings.png")
+OF_ALL = ("metrics.csv", "claims.json", "claims.md", "comparisons.csv", "aggregate.csv")
 EXPECTED, MADE = Path("reference/tables"), Path("results/tables")
-PICTURE = r"\n!\[[^]]*\]\(([^)]*)\)\n"  # as `write_page` writes them
 TABLES, README = "tables.md", "README.md"
-KEPT, READINGS = Path("reference/worlds"), "readings"
+READINGS = "readings"
 CONFIG = "config.yaml"
 
 
-def make(name: str, entry: dict[str, Any]) -> int:
-    """Make the outputs of one study; returns how many runs it has.
+def make(name: str) -> tuple[int, list[str]]:
+    """Make the outputs of one study; returns how many runs it has, and what is kept of them.
 
-    Raises `Refusal` or `ValueError` with the study's name for what cannot be.
+    Raises `ValueError` with the study's name for what cannot be.
     """
     try:
-        return _make(name, entry)
+        return _make(name)
     except (Refusal, ValueError, OSError) as error:
         raise ValueError(f"{name}: {error}") from None
 
 
-def _make(name: str, entry: dict[str, Any]) -> int:
-    folder, given = MADE / name, entry["configfiles"]
+def _make(name: str) -> tuple[int, list[str]]:
+    folder, given = MADE / name, [f"config/{file}.yaml" for file in STUDIES[name]]
     folder.mkdir(parents=True)
-    layers = [*(read_yaml(Path(file)) for file in (CONFIG, *given)), read_options(entry["config"])]
+    layers = [read_yaml(Path(file)) for file in (CONFIG, *given)]
     study = load_study(reduce(merge, layers) | {"results": str(folder)}, " + ".join(given))
     plan = Plan(study, ROOT)
-    frames, records = kept(plan, Path(entry["runs"]))
-    own, outputs = (folder, plan.with_episodes, plan.measured), entry["outputs"]
-    options = ["--config", *entry["config"]] if entry["config"] else []
-    command = shlex.join(["snakemake", "all", "--configfile", *given, *options])
-    pictures = [one for one in (*FIGURES, *plan.pictures) if f"{one}.png" in outputs]
-    curves = [one for one in FIGURES if one in pictures]
-    readings = plan.read and (plan.has_papers or "readings" in pictures)
-    results.measure(frames, plan.measured, folder, curves, plan.paper if readings else None)
-    results.tabulate(*own, plan.paper, study.labels)
+    frames, records = kept(plan, KEPT / ELSEWHERE.get(name, name))
+    made = folder, plan.with_episodes, plan.measured
+    command = shlex.join(["snakemake", "all", "--configfile", *given])
+    papers = plan.read and plan.has_papers
+    pictures = [one for one in (*FIGURES, *plan.pictures) if one != "readings" or papers]
+    results.measure(frames, plan.measured, folder, FIGURES, plan.paper if papers else None)
+    results.tabulate(*made, plan.paper, study.labels)
     results.write_table2(folder, plan.ppo_settings(), plan.paper)
     if plan.judged:
         seconds = sum(record["seconds"] for record in records)
-        results.judge(*own, plan.paper, command, seconds)
-    every = [*FIGURES, *plan.pictures]
-    results.write_page(*own, plan.paper, plan.tabulated, every, command, plan.judged)
-    results.draw(folder, pictures, *own[1:], plan.paper, plan.style, plan.judged)
-    return len(frames)
+        results.judge(*made, plan.paper, command, seconds)
+    results.write_page(*made, plan.paper, plan.tabulated, pictures, command, plan.judged)
+    results.draw(folder, pictures, *made[1:], plan.paper, plan.style, plan.judged)
+    wanted = [*OF_ALL, *(OF_PAPERS if papers else ()), *(f"{one}.png" for one in pictures)]
+    write_readme(name)
+    return len(frames), [*dict.fromkeys(o for o in wanted if (folder / o).exists()), README]
 
 
-def kept(plan: Plan, archives: Path) -> tuple[dict[RunKey, pd.DataFrame], list[dict[str, Any]]]:
+def kept(plan: Plan, folder: Path) -> tuple[dict[RunKey, pd.DataFrame], list[dict[str, Any]]]:
     """The records of each run of a study, and its run.json, in the study's order.
 
     `ValueError` for one that is not kept, `RecordError` for one of another study.
     """
-    there: dict[tuple[str, str], dict[int, kept_runs.Kept]] = {}
+    there: dict[str, kept_runs.Runs] = {}
     frames, records = {}, []
     for environment, variant, seed in plan.runs:
-        path = archives / files.folder_of(environment) / f"{variant}.tar.xz"
-        pair = environment, variant
-        if pair not in there:
-            there = {pair: kept_runs.runs_of(path)}  # one at a time: each has millions of texts
-        if seed not in there[pair]:
-            raise ValueError(f"{path} lacks seed {seed}")
-        run = there[pair][seed]
+        path = folder / f"{files.folder_of(environment)}.parquet"
+        if environment not in there:
+            there = {environment: kept_runs.read(path, plan.study.variants)}  # one at a time
+        run = there[environment].get((variant, seed))
+        if not run:
+            raise ValueError(f"{path} lacks {variant} seed {seed}")
         record = json.loads(run.record)
-        require_settings(record["config"], plan.run_settings[pair] | {"seed": seed}, str(path))
-        frames[environment, variant, seed] = kept_runs.frame(run)
+        settings = plan.run_settings[environment, variant] | {"seed": seed}
+        require_settings(record["config"], settings, str(path))
+        frames[environment, variant, seed] = run.episodes
         records.append(record)
     return frames, records
 
 
-def write_readme(name: str, outputs: list[str]) -> None:
-    """README.md of a study, beside what is kept of it: its name, its tables, these pictures."""
+def write_readme(name: str) -> None:
+    """README.md of a study, beside what is kept of it: its name, its tables and its pictures."""
     text = (MADE / name / TABLES).read_text(encoding="utf-8")
-    text = re.sub(PICTURE, lambda found: found[0] if found[1] in outputs else "", text)
-    text = re.sub("^# .*", f"# {name}", text)
-    (MADE / name / README).write_text(text, encoding="utf-8")
+    (MADE / name / README).write_text(re.sub("^# .*", f"# {name}", text), encoding="utf-8")
 
 
 def reduce_colours(picture: Path) -> None:
@@ -155,32 +163,26 @@ def main() -> None:
             parser.error(f"--cores is {arguments.cores!r}, but should be all, or at least 1")
         cores = int(arguments.cores)
     os.chdir(ROOT)
-    studies = read_yaml(STUDIES)
     if MADE.exists():
         shutil.rmtree(MADE)
     try:
-        with ProcessPoolExecutor(min(cores, len(studies))) as pool:
-            counts = [*pool.map(make, studies, studies.values())]
+        with ProcessPoolExecutor(min(cores, len(STUDIES))) as pool:
+            made = dict(zip(STUDIES, pool.map(make, STUDIES), strict=True))
     except ValueError as error:
         sys.exit(f"tables: {error}")
-    outputs = {name: entry["outputs"] for name, entry in studies.items()}
-    for name in outputs:
-        write_readme(name, outputs[name])
-        outputs[name] = [*outputs[name], README]
+    outputs = {name: kept_outputs for name, (_, kept_outputs) in made.items()}
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
     if asked := specification.make(KEPT, MADE / READINGS, cores):
         outputs[READINGS] = asked
-    made = [MADE / name / output for name, own in outputs.items() for output in own]
+    every = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
-        list(pool.map(reduce_colours, [path for path in made if path.suffix == ".png"]))
+        list(pool.map(reduce_colours, [path for path in every if path.suffix == ".png"]))
     different = [
         path for name in outputs for path in difference(name, outputs[name], arguments.check)
     ]
-    count = sum(map(len, outputs.values()))
-    print(
-        f"{count} tables and figures of {len(studies)} studies from {sum(counts)} runs, in {MADE}"
-    )
+    runs = sum(count for count, _ in made.values())
+    print(f"{len(every)} tables and figures of {len(made)} studies from {runs} runs, in {MADE}")
     if different:
         sys.exit("tables: not those that are kept: " + ", ".join(different))
 

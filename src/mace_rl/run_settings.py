@@ -27,8 +27,8 @@ from mace_rl.environments import registered
 # more, as in Gymnasium: package.module:Namespace/Id.
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 # What a study's file has besides; `mace_study.config.study` reads it.
-OF_A_STUDY = {"results", "replace", "environments", "variants", "seeds", "environment_seeds"}
-OF_A_STUDY |= {"metrics", "figure", "claims"}
+OF_A_STUDY = {"results", "replace", "environments", "variants", "seeds"}
+OF_A_STUDY |= {"environment_variants", "environment_seeds", "metrics", "figure", "claims"}
 
 # What names of environments have in them, the package that registers them, and our extra.
 PACKAGES = (("Bullet", "pybullet_envs_gymnasium", "study"), ("MiniGrid", "minigrid", "minigrid"))

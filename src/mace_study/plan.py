@@ -28,7 +28,7 @@ class Plan:
         Raises `ConfigError` for metrics, imported runs or claims that do not work.
         """
         self.study = study
-        self.measured: MetricsConfig = study.metrics.within(study.environments, study.variants)
+        self.measured: MetricsConfig = study.metrics.within(study.variants_of)
         all_metrics(self.measured)  # the user's own among them: are they metrics?
         places = [Path(study.claims), Path(project, study.claims)]
         self.claims = os.path.relpath(next(filter(Path.exists, places), places[0]))
@@ -79,7 +79,7 @@ class Plan:
     @property
     def has_papers(self) -> bool:
         """Whether there is all that the paper's Table 1 has."""
-        return self.paper.table1.is_within(self.study.environments, self.study.variants)
+        return self.paper.table1.is_within(self.study.variants_of)
 
     @property
     def read(self) -> bool:
@@ -90,7 +90,7 @@ class Plan:
     @cached_property
     def lacking(self) -> dict[str, list[str]]:
         """By family of claims, what it needs and the study lacks."""
-        return self.paper.lacking(self.study.environments, self.study.variants, self.measured)
+        return self.paper.lacking(self.study.variants_of, self.measured)
 
     @property
     def judged(self) -> bool:
@@ -129,11 +129,14 @@ class Plan:
     def ppo_settings(self) -> dict[str, dict[str, Any]]:
         """PPO's settings in each environment, and of the variants in it that have others."""
         found: dict[str, dict[str, Any]] = {}
-        for env in self.study.environments if self.trained else ():
+        for env, variants in self.study.variants_of.items():
             own = {
-                name: self.study.run_config(env, name, 0).ppo.model_dump() for name in self.trained
+                name: self.study.run_config(env, name, 0).ppo.model_dump()
+                for name in variants
+                if name in self.trained
             }
-            found[env] = own[self.trained[0]]
+            if own:
+                found[env] = next(iter(own.values()))
             for name, settings in own.items():
                 if settings != found[env]:
                     found[f"{env}: {self.study.labels[name]}"] = settings
@@ -142,7 +145,7 @@ class Plan:
     def remarks(self, known: Mapping[str, Any]) -> list[str]:
         """What cannot be said of this study, in a line each; known: Gymnasium's registry."""
         study = self.study
-        lines = study.metrics.incomplete(study.environments, study.variants)
+        lines = study.metrics.incomplete(study.variants_of)
         budgets = sorted({episodes for *_, episodes in self.with_episodes})
         short = {tuple(out_of_reach(self.measured, episodes)): episodes for episodes in budgets}
         for names, episodes in short.items():

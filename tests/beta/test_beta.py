@@ -70,6 +70,6 @@ def test_the_network_reads_which_kind_of_episode_comes_next():
 
 def planted(environment: str, variant: str) -> Trainer:
     """A training of 800 episodes."""
-    over = [ROOT / "config" / f"{name}.yaml" for name in ("questions", "planted")]
+    over = [ROOT / "config" / f"{name}.yaml" for name in ("tasks", "planted")]
     config = read_study([ROOT / "config.yaml", *over]).run_config(environment, variant, 0)
     return finish(config.model_copy(update={"episodes": 800}))

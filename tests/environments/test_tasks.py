@@ -22,7 +22,7 @@ Table = Mapping[int, Mapping[int, list[tuple[float, int, float, bool]]]]
 
 @pytest.fixture(scope="module")
 def study() -> Study:
-    return read_study([ROOT / "config.yaml", ROOT / "config" / "questions.yaml"])
+    return read_study([ROOT / "config.yaml", ROOT / "config" / "tasks.yaml"])
 
 
 def value(table: Table, start: int, steps: int, over: Callable) -> float:

@@ -54,7 +54,7 @@ def tabulate(folder: str) -> None:
     from mace_study.plan import Plan
 
     os.chdir(ROOT)
-    study = read_study([Path("config.yaml"), Path("config/reference.yaml")])  # results: reference
+    study = read_study([Path("config.yaml"), Path("reference/runs.yaml")])  # results: reference
     plan, goal = Plan(study, ROOT), Path(folder)
     goal.mkdir()
     records = [f"{run}/run.json" for run in plan.folders]

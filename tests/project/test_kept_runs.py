@@ -1,30 +1,29 @@
 """Runs that are kept come out as they went in."""
 
-import io
 import json
-import lzma
 import re
 import shutil
-import tarfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from invented import episode_columns
 from shared import message
 
 from mace_rl.base import files
+from mace_rl.library import settings
 from mace_rl.runs.provenance import file_digest
+from mace_rl.runs.run import run as train
 from mace_rl.training.records import rounded, write_episodes
 from tools import kept_runs
 
 
-def make_run(folder: Path, number: int, agent: bytes = b"agent", episodes: int = 30) -> None:
+def make_run(folder: Path, number: int, episodes: int = 30, agent: bytes = b"agent") -> None:
     folder.mkdir(parents=True)
     columns = episode_columns(episodes, number)
-    for name in ("intrinsic_return", "beta"):
-        columns[name] = np.array([rounded(value) for value in columns[name]])
-    if number % 2 == 0:
+    columns["beta"] = np.array([rounded(value) for value in columns["beta"]])
+    if number % 2 == 0:  # the others have all digits of a double
         columns["extrinsic_return"] = -columns["length"].astype(float)
     write_episodes(folder / files.EPISODES, columns)
     (folder / files.AGENT).write_bytes(agent)
@@ -36,52 +35,49 @@ def make_run(folder: Path, number: int, agent: bytes = b"agent", episodes: int =
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """The files in a folder but for agents, which are not kept."""
-    found = {path for path in folder.rglob("*") if path.is_file()}
-    found -= {*folder.rglob(files.AGENT)}
+    found = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(found)}
 
 
 def test_what_was_packed_comes_out(tmp_path: Path) -> None:
+    """But for `intrinsic_return`; compared with what pandas reads of the run's own file."""
     results, kept = tmp_path / "results", tmp_path / "kept"
-    runs = "A-v1/ppo/seed100", "A-v1/ppo/seed1000", "A-v1/ppo/seed99", "B-v0/mace_full/seed3"
+    runs = "A-v1/ppo/seed100", "A-v1/mace_full/seed1000", "A-v1/ppo/seed99", "B-v0/ppo/seed3"
     for number, run in enumerate(runs):
         make_run(results / "runs" / run, number, episodes=20 + 7 * number)
     (results / "runs/A-v1/ppo/seed11").mkdir()  # not finished
-    make_run(results / "runs/B-v0/mace_full/seed100", 4)
-    assert kept_runs.pack(results, kept) == 5
-    assert sorted(content(kept)) == ["A-v1/ppo.tar.xz", "B-v0/mace_full.tar.xz"]
-    assert kept_runs.unpack(kept, tmp_path / "again") == 5
-    assert content(tmp_path / "again") == content(results)
-    assert not [*(tmp_path / "again").rglob(files.AGENT)]
-
-
-def test_a_column_is_kept_in_the_form_that_takes_least_room(tmp_path: Path) -> None:
-    draws, run = np.random.default_rng(0), tmp_path / "results/runs/A-v1/ppo/seed1"
-    make_run(run, 1, episodes=3000)  # the 2nd in all digits, the 3rd and the 4th in six
-    columns = {
-        "episode": np.arange(1, 3001),
-        "env_steps": np.arange(200, 600001, 200),
-        "length": np.full(3000, 200),
-        "extrinsic_return": draws.normal(size=3000) * 1e3,
-        "intrinsic_return": np.array([rounded(10.0**each) for each in draws.uniform(-9, 9, 3000)]),
-        "beta": np.array([rounded(value) for value in draws.uniform(0, 0.5, 3000)]),
-        "terminated": np.zeros(3000, int),
+    assert kept_runs.pack(results, kept) == 4
+    assert sorted(content(kept)) == ["A-v1.parquet", "B-v0.parquet"]
+    found = {
+        (path.stem, *key): run
+        for path in kept.glob("*.parquet")
+        for key, run in kept_runs.read(path).items()
     }
-    columns["intrinsic_return"][:2], columns["extrinsic_return"][:2] = (0.0, 1e-300), (0.0, -0.0)
+    for run in runs:
+        env, variant, seed = run.split("/")
+        record, episodes = found.pop((env, variant, int(seed[4:])))
+        assert record == (results / "runs" / run / files.RECORD).read_text()
+        whole = pd.read_csv(results / "runs" / run / files.EPISODES)
+        pd.testing.assert_frame_equal(episodes, whole[episodes.columns], check_exact=True)
+        assert {*whole.columns} - {*episodes.columns} == {"intrinsic_return"}
+    assert not found
+    assert [*kept_runs.read(kept / "A-v1.parquet", ["mace_full"])] == [("mace_full", 1000)]
+    assert kept_runs.read(kept / "A-v1.parquet", ["mace_fixed"]) == {}
+
+
+def test_six_digits_of_any_size_are_exact(tmp_path: Path) -> None:
+    draws, run = np.random.default_rng(0), tmp_path / "results/runs/A-v1/ppo/seed1"
+    make_run(run, 1, episodes=3000)
+    columns = episode_columns(3000)
+    columns["beta"] = np.array([rounded(10.0**power) for power in draws.uniform(-9, 0, 3000)])
     write_episodes(run / files.EPISODES, columns)
     record = json.loads((run / files.RECORD).read_text())
     record["outputs"][files.EPISODES] = file_digest(run / files.EPISODES)
     (run / files.RECORD).write_text(json.dumps(record))
     kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    archive = tmp_path / "kept/A-v1/ppo.tar.xz"
-    with tarfile.open(archive) as tar:
-        sizes = {member.name: member.size for member in tar}
-    forms = ["beta.digits", "extrinsic_return.doubles", "intrinsic_return.digits", "length"]
-    assert sorted(sizes) == [*forms, "seed1/run.json", "terminated"]
-    text = (run / files.EPISODES).read_bytes()
-    assert archive.stat().st_size < 0.8 * len(lzma.compress(text))
-    assert kept_runs.read(archive)[f"seed1/{files.EPISODES}"] == text
+    ((_, episodes),) = kept_runs.read(tmp_path / "kept/A-v1.parquet").values()
+    assert (episodes["beta"] == columns["beta"]).all()
+    assert (episodes["extrinsic_return"] == columns["extrinsic_return"]).all()
 
 
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
@@ -99,132 +95,81 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
     make_run(run, 1)
     kept_runs.pack(tmp_path / "results", kept)
     before = content(kept)
-    records = (run / files.EPISODES).read_bytes()
-    (run / files.EPISODES).write_bytes(records.replace(b"0", b"1"))
-    with pytest.raises(ValueError, match=r"episodes\.csv: missing, cut off or altered"):
-        kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    (run / files.EPISODES).write_bytes(records)
     shutil.rmtree(run)
     make_run(run, 2)
-    with pytest.raises(ValueError, match=r"ppo\.tar\.xz has another run of this seed"):
+    with pytest.raises(ValueError, match=r"A-v1\.parquet has another run of this seed"):
         kept_runs.pack(tmp_path / "results", kept)
-    assert content(kept) == before
-    others = content(tmp_path / "results")
-    with pytest.raises(ValueError, match=r"seed100/.* there already, and not the kept one"):
-        kept_runs.unpack(kept, tmp_path / "results")
-    assert content(tmp_path / "results") == others
+    text = (run / files.EPISODES).read_text()
+    (run / files.EPISODES).write_text(text.replace("0", "1"))
+    with pytest.raises(ValueError, match=r"episodes\.csv: "):
+        kept_runs.pack(tmp_path / "results", tmp_path / "new")
+    assert content(kept) == before and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("command", ["pack", "unpack"])
-@pytest.mark.parametrize("folder", ["nope", "without a finished run"])
-def test_where_there_are_no_runs_nothing_is_done(tmp_path, monkeypatch, command, folder) -> None:
-    origin, goal = tmp_path / folder, tmp_path / "goal"
-    (tmp_path / "without a finished run/runs/A-v1/ppo/seed0").mkdir(parents=True)
-    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
-    kept_runs.pack(tmp_path / "results", goal)  # what is there already does not count
-    before = content(tmp_path)
-    wanted = {"pack": "runs/ENV/VARIANT/seedN/run.json", "unpack": "ENV/VARIANT.tar.xz"}[command]
-    said = message(monkeypatch, kept_runs, command, str(origin), str(goal))
-    assert said == f"kept_runs: {origin}: no {wanted} in it"
-    assert content(tmp_path) == before
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["pack", "nope", "goal"], "nope: no runs/ENV/VARIANT/seedN/run.json in it"),
+        (["pack", "unfinished", "goal"], "unfinished: no runs/ENV/VARIANT/seedN/run.json in it"),
+        (["verify", "nope"], "nope: 0 runs in it that take less than 60 s"),
+        (["verify", "kept", "--sample", "0"], "--sample is a number of runs, at least 1"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch, words, said) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "unfinished/runs/A-v1/ppo/seed0").mkdir(parents=True)
+    assert message(monkeypatch, kept_runs, *words) == f"kept_runs: {said}"
+    assert not (tmp_path / "goal").exists()
 
 
-def test_records_that_columns_cannot_give_back_are_refused(tmp_path: Path) -> None:
-    """Whatever training never wrote: here a number of steps that is not the sum of the lengths."""
-    run = tmp_path / "results/runs/A-v1/ppo/seed1"
-    make_run(run, 1)
-    lines = (run / files.EPISODES).read_text().splitlines(keepends=True)
-    lines[3] = lines[3].replace(",", ",1", 1)
-    (run / files.EPISODES).write_text("".join(lines))
-    record = json.loads((run / files.RECORD).read_text())
-    record["outputs"][files.EPISODES] = file_digest(run / files.EPISODES)
-    (run / files.RECORD).write_text(json.dumps(record))
-    with pytest.raises(ValueError, match=r"seed1/episodes\.csv is not as a training writes it"):
-        kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    assert not (tmp_path / "kept").exists()
-
-
-def test_a_sample_is_of_short_runs_of_different_archives(tmp_path: Path) -> None:
+def test_a_sample_is_of_short_runs_of_different_variants(tmp_path: Path) -> None:
     for number in range(9):  # which take 0 to 80 seconds
         make_run(tmp_path / f"results/runs/{'AB'[number % 2]}-v0/v{number // 2}/seed100", number)
     kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    assert kept_runs.unpack_sample(tmp_path / "kept", tmp_path / "sample", 4) == 4
-    found = content(tmp_path / "sample")
-    whole = content(tmp_path / "results")
-    assert found.items() <= whole.items() and len(found) == 2 * 4
+    found = [json.loads(run.record) for run in kept_runs.sample(tmp_path / "kept", 4)]
+    assert len({record["config"]["seed"] for record in found}) == 4
+    assert all(record["seconds"] < 60 for record in found)
+    assert found == [json.loads(run.record) for run in kept_runs.sample(tmp_path / "kept", 4)]
     with pytest.raises(ValueError, match="6 runs in it that take less than 60 s"):
-        kept_runs.unpack_sample(tmp_path / "kept", tmp_path / "more", 7)
+        list(kept_runs.sample(tmp_path / "kept", 7))
 
 
-def tar_of(members: list[tuple[str, bytes, bytes]]) -> bytes:
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w") as tar:
-        for name, data, kind in members:
-            member = tarfile.TarInfo(name)
-            member.size, member.type, member.linkname = len(data), kind, "/etc/passwd"
-            tar.addfile(member, io.BytesIO(data))
-    return lzma.compress(buffer.getvalue())
-
-
-OTHER = '{"episodes.csv": "of other episodes"}'
-
-
-def with_record(episodes: str, seconds: str = "1", text: str = "") -> dict[str, bytes]:
-    whole = f'{{"seconds": {seconds}, "config": {{"episodes": {episodes}}}, "outputs": {OTHER}}}'
-    return {"seed1/run.json": (text or whole).encode()}
-
-
-HOSTILE = {  # members that are added or replaced, by what is said of them
-    "should not have '../../x'": {"../../x": b""},
-    "should not have '/tmp/x'": {"/tmp/x": b""},
-    "should not have 'seed1/../x/run.json'": {"seed1/../x/run.json": b"{}"},
-    "should not have 'seed1/agent.pt'": {"seed1/agent.pt": b""},
-    "should not have 'seed1/episodes.csv'": {"seed1/episodes.csv": b""},
-    "has -5 episodes": with_record("-5"),
-    "has 0 episodes": with_record("0"),
-    "has True episodes": with_record("true"),
-    "has 1000000000000 episodes, of which there are 30": with_record("1000000000000"),
-    "run.json has other episodes": with_record("30"),
-    "list indices": with_record("", text="[]"),
-    "'config'": with_record("", text="{}"),
-    "has None seconds": with_record("30", "null"),
-    "recursion": with_record("", text="[" * 10**5),
-    "invalid literal": {"length": b"\n".join([b"1e9"] * 30)},
-    "should not have 'beta.halves'": {"beta.halves": b""},
-    "should not have 'length.doubles' beside another form": {"length.doubles": bytes(240)},
-    "cannot reshape": {"length": None, "length.doubles": bytes(241)},
-    "zip()": {"length": None, "length.digits": bytes(182)},
-    "larger than": {"length": bytes(kept_runs.EXPANDED)},
-}
-
-
-DAMAGED = [  # links and the like, and what is no archive
-    *(tar_of([("seed1/run.json", b"", kind)]) for kind in (b"1", b"2", b"5", b"6", b"S")),
-    *(tar_of([("length", b"", b"0")] * 2), tar_of([("length", b"", b"0")])[:-9]),
-    *(lzma.compress(b"tar" * 999), b"no xz", b""),
-]
-
-
-@pytest.mark.parametrize(("said", "damage"), [*HOSTILE.items(), *(("", one) for one in DAMAGED)])
-def test_what_was_never_packed_is_refused_in_one_line(tmp_path, monkeypatch, said, damage) -> None:
-    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1)
+@pytest.mark.slow
+def test_a_kept_run_is_trained_again_and_a_difference_named(tmp_path, monkeypatch, capsys) -> None:
+    config = settings("CartPole-v1", "mace_full", seed=3, episodes=20)
+    train(config, tmp_path / "results/runs/CartPole-v1/mace_full/seed3")
     kept_runs.pack(tmp_path / "results", tmp_path / "kept")
-    path = tmp_path / "kept/A-v1/ppo.tar.xz"
-    with tarfile.open(path) as tar:
-        members = {name: tar.extractfile(name).read() for name in tar.getnames()}
-    if isinstance(damage, dict):
-        members |= damage
-        damage = tar_of([(*one, b"0") for one in members.items() if one[1] is not None])
-    path.write_bytes(damage)
-    for name in ("..", ".", ""):  # which would be other folders
-        odd = tmp_path / "odd" / "A-v1" / f"{name}.tar.xz"
-        odd.parent.mkdir(parents=True, exist_ok=True)
-        odd.write_bytes(path.read_bytes())
-        with pytest.raises(ValueError, match="its name is not"):
-            kept_runs.read(odd)
-    before = content(tmp_path)
-    for sample in ([], ["--sample", "1"]):
-        words = "unpack", str(path.parents[1]), str(tmp_path / "goal"), *sample
-        found = message(monkeypatch, kept_runs, *words)
-        assert re.search(rf"ppo\.tar\.xz .*{re.escape(said)}", found)
-    assert content(tmp_path) == before
+    monkeypatch.setattr(kept_runs, "LONGEST", np.inf)  # on a busy machine
+    words = ["kept_runs", "verify", str(tmp_path / "kept"), "--sample", "1"]
+    monkeypatch.setattr("sys.argv", words)
+    kept_runs.main()
+    line = "CartPole-v1 mace_full seed 3: equal to the bit\n1 of 1 runs equal to the bit\n"
+    assert capsys.readouterr().out == line
+    path = tmp_path / "kept/CartPole-v1.parquet"
+    ((key, run),) = kept_runs.read(path).items()
+    run.episodes.loc[7, "beta"] += 1e-3
+    kept_runs.write(path, {key: run})
+    with pytest.raises(SystemExit, match="1"):
+        kept_runs.main()
+    assert "seed 3: different" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("damage", ["cut off", "a byte", "no parquet", "other columns", "a record"])
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, damage: str) -> None:
+    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1, episodes=300)
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    path = tmp_path / "kept/A-v1.parquet"
+    data = path.read_bytes()
+    if damage == "cut off":
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == "a byte":  # in the middle of the returns
+        path.write_bytes(data[:2500] + bytes([data[2500] ^ 1]) + data[2501:])
+    elif damage == "no parquet":
+        path.write_text("nothing")
+    elif damage == "other columns":
+        pd.DataFrame({"variant": ["ppo"]}).to_parquet(path)
+    else:
+        pd.read_parquet(path).assign(digest="0" * 64).to_parquet(path)
+    with pytest.raises(ValueError, match=re.escape(str(path))) as refused:
+        kept_runs.read(path)
+    assert "\n" not in str(refused.value)

@@ -11,11 +11,10 @@ import pandas as pd
 import pytest
 from invented import ROBUST, ROOT
 
-from mace_rl.base import files
 from mace_rl.config.plugins import load
 from mace_rl.config.run import RunConfig
 from mace_study.config.study import Study, read_study
-from tools import kept_runs, specification
+from tools import kept_runs, specification, tables
 
 # By the commit that runs name: their protocol as it lies there, and where it lies today.
 PROTOCOLS = {
@@ -24,40 +23,26 @@ PROTOCOLS = {
     "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
     "08d9a0b": ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
 }
-WORLDS = {  # what is read over config.yaml
-    "tuned": ["worlds/tuned"],
-    "plain": ["plain", "worlds/plain"],
-    "published": ["published", "worlds/published"],
-    "exploration": ["questions", "worlds/questions"],
-    "controls": ["questions", "controls", "worlds/controls"],
-    "planted": ["questions", "planted", "worlds/planted"],
-    "distracting": ["questions", "worlds/distracting"],
-    "decided": ["plain", "worlds/decided"],
-    "initial": ["plain", "worlds/initial"],
-    "minigrid": ["questions", "controls", "minigrid", "worlds/minigrid"],
-    "readings": ["plain", "worlds/readings"],
-}
-TASKS = ("exploration", "controls", "planted", "distracting")  # whose runs lie together
+FOLDERS = sorted(set(tables.STUDIES) - set(tables.ELSEWHERE))
 
 
 def world(name: str) -> Study:
-    paths = [ROOT / "config" / f"{path}.yaml" for path in WORLDS[name]]
+    paths = [ROOT / "config" / f"{path}.yaml" for path in tables.STUDIES[name]]
     return read_study([ROOT / "config.yaml", *paths])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", [*sorted(set(WORLDS) - set(TASKS)), "tasks"])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(folder) -> None:
     """And the protocol is today, byte for byte, what it was then."""
     records = kept(ROOT / "reference" / "worlds" / folder)
-    names = TASKS if folder == "tasks" else [folder]
-    own = {"mace_lstm", "mace_credit", "mace_pretrained_no_memory"}  # asked by the first alone
+    names = [name for name in tables.STUDIES if tables.ELSEWHERE.get(name, name) == folder]
     asked = {run for name in names for run in world(name).runs()}
     for place, seeds in specification.WORLDS.values():
         if place == folder:
             cells = product(seeds, specification.READINGS)
             asked |= {(env, name, seed) for env, name in cells for seed in seeds[env]}
-    assert {run for run in records if run[1] not in own} <= asked
+    assert {*records} <= asked
     git, told = ["git", "-C", str(ROOT)], {"capture_output": True}
     shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)
     if shallow.stdout.strip() != b"false" or not records:
@@ -78,7 +63,7 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", ["tuned", "plain", "published", "tasks", "minigrid"])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_what_is_kept_has_settings_that_still_load(folder) -> None:
     """Also the names of modules in them: one run of each environment and variant."""
     records = kept(ROOT / "reference" / "worlds" / folder)
@@ -89,13 +74,12 @@ def test_what_is_kept_has_settings_that_still_load(folder) -> None:
                 load(reference, "reference")
 
 
-def kept(archives: Path) -> dict[tuple[str, str, int], dict]:
+def kept(folder: Path) -> dict[tuple[str, str, int], dict]:
     """run.json of every kept run."""
     records = [
-        json.loads(content)
-        for archive in sorted(archives.glob("*/*.tar.xz"))
-        for name, content in kept_runs.read(archive).items()
-        if name.endswith(files.RECORD)
+        json.loads(run.record)
+        for path in sorted(folder.glob("*.parquet"))
+        for run in kept_runs.read(path).values()
     ]
     return {
         tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
@@ -134,12 +118,12 @@ def test_each_p_that_hangs_on_chance_is_named_by_the_page_and_exact_there() -> N
     page = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
     told = re.findall(r"(?<=\| )0\.\d{3} \(0\.\d{3}\)(?= \|)", page)
     exact = []
-    for name in WORLDS:
-        tables = ROOT / "reference" / "tables" / name
-        if not (tables / "claims.json").exists():
+    for name in tables.STUDIES:
+        folder = ROOT / "reference" / "tables" / name
+        if not (folder / "claims.json").exists():
             continue
-        runs = pd.read_csv(tables / "metrics.csv")
-        content = json.loads((tables / "claims.json").read_text(encoding="utf-8"))
+        runs = pd.read_csv(folder / "metrics.csv")
+        content = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
         families: dict[str, list[dict]] = {}
         for claim in content["claims"]:
             families.setdefault(claim["family"], []).extend(claim[ROBUST]["parts"])

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import yaml
 from PIL import Image
@@ -40,16 +39,6 @@ def test_editors_are_told_what_a_configuration_may_be() -> None:
             validate(read_options([wrong]), str(schema.GOAL))
 
 
-def test_what_is_kept_of_the_weights_that_stay_is_their_study() -> None:
-    files = [
-        "config.yaml",
-        *(f"config/{name}.yaml" for name in ("questions", "controls", "weights")),
-    ]
-    kept = pd.read_csv(ROOT / "reference/measured/weights.csv")
-    cells = [*kept[["env", "variant", "seed"]].itertuples(index=False, name=None)]
-    assert cells == [*read_study([ROOT / name for name in files]).runs()]
-
-
 def test_a_kept_picture_has_256_colours_and_looks_the_same(tmp_path: Path) -> None:
     draws = np.random.default_rng(0)
     colours = np.full((200, 200, 3), 255, np.uint8)
@@ -77,14 +66,15 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     for seed in (0, 1):
         folder = tmp_path / f"results/runs/CartPole-v1/ppo/seed{seed}"
         run.run(study.run_config("CartPole-v1", "ppo", seed), folder)
-    kept_runs.pack(tmp_path / "results", tmp_path / "reference/small")
-    wanted = {"configfiles": ["config/small.yaml"], "config": []}
-    wanted |= {"runs": "reference/small", "outputs": ["metrics.csv", "figure1.png"]}
-    studies, kept = tmp_path / "reference/studies.yaml", tmp_path / "reference/tables/small"
-    studies.write_text(yaml.safe_dump({"small": wanted}))
+    kept_runs.pack(tmp_path / "results", tmp_path / "reference/worlds/small")
+    kept, archive = (
+        tmp_path / "reference/tables/small",
+        "reference/worlds/small/CartPole-v1.parquet",
+    )
 
     def tabulate(*words: str) -> tuple[str, str]:
         script = "from pathlib import Path; from tools import tables; "
+        script += "tables.STUDIES = {'small': ('small',)}; "
         script += f"tables.ROOT = Path({str(tmp_path)!r}); tables.main()"
         command = [sys.executable, "-c", script, *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
@@ -94,12 +84,13 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     stale = tmp_path / "results/tables/small/stale"
     stale.parent.mkdir(parents=True)
     stale.touch()
-    names = ("metrics.csv", "figure1.png", "README.md")
-    made = "3 tables and figures of 1 studies from 2 runs, in results/tables\n"
+    names = ["metrics.csv", "comparisons.csv", "aggregate.csv"]
+    names += ["figure1.png", "figure2.png", "every_seed.png", "README.md"]
+    made = "7 tables and figures of 1 studies from 2 runs, in results/tables\n"
     new = "".join(f"new: reference/tables/small/{name}\n" for name in names)
     assert tabulate() == (new + made, "") and not stale.exists()
     readme = (kept / "README.md").read_text()
-    assert readme.startswith("# small\n") and readme.count("![") == 1
+    assert readme.startswith("# small\n") and readme.count("![") == 3
     with Image.open(kept / "figure1.png") as picture:
         assert picture.mode == "P"
     assert "![figure1](figure1.png)" in readme and "## Mean return of training" in readme
@@ -115,13 +106,11 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path) -> None:
     assert tabulate() == ("renewed: reference/tables/small/README.md\n" + made, "")
     assert (kept / "README.md").read_text() == readme
 
-    studies.write_text(yaml.safe_dump({"small": wanted, "bad": wanted | {"config": ["seeds=[2]"]}}))
-    output, error = tabulate()
-    assert "tables: bad: " in error and "ppo.tar.xz lacks seed 2" in error and not output
-    [archive] = (tmp_path / "reference/small").rglob("*.tar.xz")
-    archive.write_bytes(archive.read_bytes()[:1000])
-    studies.write_text(yaml.safe_dump({"small": wanted}))
-    assert tabulate()[1].startswith("tables: small: reference/small/CartPole-v1/ppo.tar")
+    over = tmp_path / "config/small.yaml"
+    over.write_text(over.read_text().replace("- 1\n", "- 2\n"))
+    assert tabulate() == ("", f"tables: small: {archive} lacks ppo seed 2")
+    (tmp_path / archive).write_bytes((tmp_path / archive).read_bytes()[:1000])
+    assert tabulate()[1].startswith(f"tables: small: {archive} is not as")
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_tables_and_figures_are_the_same() -> None:
 
 EXPECTED = ROOT / "docs" / "reduced"
 STUDY = read_study([ROOT / "config.yaml", ROOT / "config" / "reduced.yaml"])
-METRICS = STUDY.metrics.within(STUDY.environments, STUDY.variants)
+METRICS = STUDY.metrics.within(STUDY.variants_of)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ docs/metrics.md ("The rule") and reference/worlds/protocol.md say what is comput
 which parts and settings. What made the tables is not imported: a mistake would be needed twice.
 """
 
-import io
 import itertools
 import json
 from functools import reduce
@@ -16,14 +15,13 @@ import pytest
 import yaml
 from scipy import stats
 
-from tools import kept_runs
+from tools import kept_runs, tables
 
 ROOT = Path(__file__).parents[2]
 TABLES = ROOT / "reference" / "tables"
-STUDIES = yaml.safe_load((ROOT / "reference" / "studies.yaml").read_text(encoding="utf-8"))
 CLAIMS = yaml.safe_load((ROOT / "config" / "claims.yaml").read_text(encoding="utf-8"))
 PAPER = CLAIMS["table1"]["values"]
-JUDGED = [name for name, study in STUDIES.items() if "claims.json" in study["outputs"]]
+JUDGED = [name for name in tables.STUDIES if (TABLES / name / "claims.json").exists()]
 DRAWN = pd.read_csv(TABLES / "worlds" / "draws.csv").set_index("world")
 RULES = {  # of both metrics
     rule: rule.split(" / ") for rule in DRAWN["rule"].unique()
@@ -44,14 +42,20 @@ def merged(under: object, over: object) -> object:
 
 
 def settings(name: str) -> dict:
-    paths = [ROOT / path for path in ("config.yaml", *STUDIES[name]["configfiles"])]
-    sections = [yaml.safe_load(path.read_text(encoding="utf-8")) for path in paths]
-    items = [item.split("=", 1) for item in STUDIES[name]["config"]]
-    return reduce(merged, [*sections, *({key: yaml.safe_load(text)} for key, text in items)])
+    paths = [ROOT / "config.yaml", *(ROOT / f"config/{file}.yaml" for file in tables.STUDIES[name])]
+    return reduce(merged, (yaml.safe_load(path.read_text(encoding="utf-8")) for path in paths))
 
 
 def seeds_of(study: dict, env: str) -> list[int]:
-    return study.get("environment_seeds", {}).get(env, study["seeds"])
+    seeds = study.get("environment_seeds", {}).get(env, study["seeds"])
+    ends = (map(int, text.split("-")) for text in (seeds if isinstance(seeds, list) else [seeds]))
+    return [seed for first, last in ends for seed in range(first, last + 1)]
+
+
+def variants_in(study: dict, env: str) -> set[str]:
+    if env not in study["environments"]:
+        return set()
+    return {*study.get("environment_variants", {}).get(env, study["variants"])}
 
 
 def asked(study: dict) -> list[dict]:
@@ -70,9 +74,11 @@ def asked(study: dict) -> list[dict]:
                 for where, over in itertools.product(each, part["over"] or [None]):
                     names = [family, claim, way, where, own[0], *map(as_learned, (own[1], over))]
                     parts.append(dict(zip(NAMES, names, strict=True)))
-        variants = {part[key] for part in parts for key in ("variant", "baseline")} - {None}
-        where = {env for part in parts for env in part["environments"]}
-        if variants <= {*study["variants"]} and where <= {*study["environments"]}:
+        if all(
+            {part["variant"], part["baseline"]} - {None} <= variants_in(study, env)
+            for part in parts
+            for env in part["environments"]
+        ):
             found += parts
     return found
 
@@ -178,7 +184,7 @@ def concluded(parts: pd.DataFrame) -> str:
 @pytest.mark.parametrize("name", JUDGED)
 def test_verdicts_are_those_of_the_page(name: str) -> None:
     study, runs = settings(name), pd.read_csv(TABLES / name / "metrics.csv")
-    if "betas.csv" in STUDIES[name]["outputs"]:
+    if (TABLES / name / "betas.csv").exists():
         runs = runs.merge(pd.read_csv(TABLES / name / "betas.csv"), on=["env", "variant", "seed"])
     claims = json.loads((TABLES / name / "claims.json").read_text(encoding="utf-8"))["claims"]
     said = [(claim, way) for claim in claims for way in CLAIMS["ways"] if way in claim]
@@ -220,9 +226,9 @@ def test_verdicts_are_those_of_the_page(name: str) -> None:
         assert [claim[way]["outcome"], claim[way]["verdict"]] == [outcome, words[outcome]]
 
 
-def by_public_code(episodes: bytes, random_return: float, own: dict) -> list[int]:
+def by_public_code(episodes: pd.DataFrame, random_return: float, own: dict) -> list[int]:
     """`PUBLIC_CODE` of a run and, last, `AS_NAMED`'s; all episodes where it never gets there."""
-    returns = pd.read_csv(io.BytesIO(episodes))["extrinsic_return"].to_numpy(float)
+    returns = episodes["extrinsic_return"].to_numpy(float)
     count, window = len(returns), own["moving_average"]
     end = returns[-round(own["final_fraction"] * count) :]
     learned = end.mean() > random_return + 2 * end.std(ddof=1) / np.sqrt(len(end))
@@ -240,9 +246,10 @@ def measured(name: str, study: dict, env: str, variant: str) -> np.ndarray:
     """`by_public_code` of all runs of a variant; metrics.csv has the same."""
     if variant == "mace_full":
         variant = study["metrics"].get("learned", variant)
-    runs = kept_runs.read(ROOT / STUDIES[name]["runs"] / env / f"{variant}.tar.xz")
+    folder = ROOT / tables.KEPT / tables.ELSEWHERE.get(name, name)
+    runs = kept_runs.read(folder / f"{env}.parquet", [variant])
     given = study["metrics"]["random_return"][env], study["metrics"]
-    episodes = [runs[f"seed{seed}/episodes.csv"] for seed in seeds_of(study, env)]
+    episodes = [runs[variant, seed].episodes for seed in seeds_of(study, env)]
     own = np.array([by_public_code(each, *given) for each in episodes])
     kept = pd.read_csv(TABLES / name / "metrics.csv").set_index(["env", "variant"])
     names = [*PUBLIC_CODE, AS_NAMED[0]]
@@ -252,9 +259,9 @@ def measured(name: str, study: dict, env: str, variant: str) -> np.ndarray:
 
 @pytest.mark.slow
 def test_runs_that_have_not_learned_never_reach_the_threshold() -> None:
-    study = settings("controls")  # in this task a strong bonus keeps most runs from learning
+    study = settings("tasks")  # in this task a strong bonus keeps most runs from learning
     for variant in study["variants"]:
-        measured("controls", study, "NoisyDeepSea7-v0", variant)
+        measured("tasks", study, "NoisyDeepSea7-v0", variant)
 
 
 def places(values: np.ndarray, among: np.ndarray, left_out: int = 0) -> np.ndarray:

@@ -325,9 +325,15 @@ def test_what_a_study_lacks_for_a_family() -> None:
     for title, family in CLAIMS.families.items():
         parts = [part for _, part in parts_of(family)]
         names = {name for part in parts for name in (*part.environments, part.variant, *part.over)}
-        assert CLAIMS.lacking(names, names, QUESTIONED)[title] == []
+        whole = {env: [*names] for env in {env for part in parts for env in part.environments}}
+        assert CLAIMS.lacking(whole, QUESTIONED)[title] == []
         for name in names:
-            assert CLAIMS.lacking(names - {name}, names - {name}, QUESTIONED)[title] == [name]
+            left = [*names - {name}]
+            without = {env: left for env in whole if env != name}
+            assert CLAIMS.lacking(without, QUESTIONED)[title] == [name]
+        one = parts[0]  # whose variant one environment lacks
+        less = whole | {one.environments[0]: [*names - {one.variant}]}
+        assert CLAIMS.lacking(less, QUESTIONED)[title] == [one.variant]
         bare = QUESTIONED.model_copy(update={"reference_return": {}})
-        (first, *_) = CLAIMS.lacking(names, names, bare)[title]
+        (first, *_) = CLAIMS.lacking(whole, bare)[title]
         assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))

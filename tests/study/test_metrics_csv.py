@@ -163,29 +163,38 @@ def test_what_is_no_metric_is_refused(own, problem, custom):
         table(settings=custom(m.Metric("x_censored", "X", "return", lambda curve: 0.0), own))
 
 
+def each(environments, variants):
+    return dict.fromkeys(environments, variants)
+
+
 def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
     def names(environments, **changes):
-        settings = check(MetricsConfig, SETTINGS | changes, "test").within(environments, ["ppo"])
+        settings = check(MetricsConfig, SETTINGS | changes, "test").within(
+            each(environments, ["ppo"])
+        )
         return [metric.name for metric in m.all_metrics(settings) if metric.needs]
 
     assert names(ENVIRONMENTS) == ["solved", "sample_efficiency_common"]
     assert names(["CartPole-v1", "Other-v0"]) == []
     assert names(ENVIRONMENTS, solved_return={"CartPole-v1": 475.0}) == ["sample_efficiency_common"]
     assert names(["CartPole-v1"], reference_return={}) == ["solved"]
-    columns = table(settings=CONFIG.within([*ENVIRONMENTS, "Other-v0"], VARIANTS)).columns
+    columns = table(settings=CONFIG.within(each([*ENVIRONMENTS, "Other-v0"], VARIANTS))).columns
     assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
     chosen = {"constants": {"learned": "mace_full", "fixed": ["ppo", "beta_1"]}}
     drawn = check(MetricsConfig, SETTINGS | chosen, "test")
-    lines = drawn.incomplete([*ENVIRONMENTS, "Other-v0"], VARIANTS)
+    lines = drawn.incomplete(each([*ENVIRONMENTS, "Other-v0"], VARIANTS))
     assert [line.split()[0].partition(".")[2] for line in lines] == [*GOALS, "constants"]
     assert [line.split()[-1] for line in lines] == ["Other-v0", "Other-v0", "beta_1"]
-    assert CONFIG.incomplete(ENVIRONMENTS, []) == CONFIG.incomplete(["Other-v0"], []) == []
-    assert drawn.within(ENVIRONMENTS, VARIANTS).constants is None
-    assert drawn.within(ENVIRONMENTS, ["ppo", "beta_1", "mace_full"]).constants == drawn.constants
+    assert CONFIG.incomplete(each(ENVIRONMENTS, [])) == CONFIG.incomplete({"Other-v0": []}) == []
+    assert drawn.within(each(ENVIRONMENTS, VARIANTS)).constants is None
+    assert (
+        drawn.within(each(ENVIRONMENTS, ["ppo", "beta_1", "mace_full"])).constants
+        == drawn.constants
+    )
 
 
 def test_a_goal_that_random_actions_attain_is_refused():
     settings = check(MetricsConfig, SETTINGS | {"solved_return": {"CartPole-v1": 22.1}}, "test")
     problem = r"metrics\.solved_return\.CartPole-v1 is 22\.1, but should be greater than .*, 22\.1"
     with pytest.raises(ConfigError, match=problem):
-        settings.within(ENVIRONMENTS, VARIANTS)
+        settings.within(each(ENVIRONMENTS, VARIANTS))

@@ -233,7 +233,7 @@ def test_every_study_of_the_project_can_be_carried_out(path: Path) -> None:
     study = read_study([CONFIG, *layers])
     for run in study.runs():
         study.run_config(*run)
-    study.metrics.within(study.environments, study.variants)
+    study.metrics.within(study.variants_of)
     read_claims(study, CONFIG.parent / study.claims)
 
 

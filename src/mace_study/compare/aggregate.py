@@ -32,11 +32,14 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of aggregate.csv: of each metric and variant the mean and interquartile mean score.
 
     Columns: metric, variant, runs, then for mean and iqm the estimate and its interval, NaN if an
-    environment has one seed. Every environment weighs as much as it has runs.
+    environment has one seed. Every environment weighs as much as it has runs. Variants that do not
+    have runs in all environments are left out.
     """
     rows, repetitions = [], settings.bootstrap_repetitions
-    groups = scores(table, settings).groupby(["metric", "variant"], sort=False)
-    for (metric, variant), runs in groups:
+    everywhere = table.groupby("variant")["env"].nunique() == table["env"].nunique()
+    scored = scores(table, settings)
+    scored = scored[scored["variant"].map(everywhere)]
+    for (metric, variant), runs in scored.groupby(["metric", "variant"], sort=False):
         strata = [group["score"].to_numpy() for _, group in runs.groupby("env", sort=False)]
         smallest = min(len(values) for values in strata)
         generator = np.random.default_rng(settings.bootstrap_seed)

@@ -1,7 +1,7 @@
 """What a paper says, and what we ask ourselves: the file that `claims` in config.yaml names."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -63,9 +63,9 @@ class Table1Config(Section):
             return {}
         return {name: rows[name][self.metrics.index(kind)] for name in self.variants}
 
-    def is_within(self, environments: Iterable[str], variants: Iterable[str]) -> bool:
-        """Whether a study of these has all that the table has."""
-        return set(self.values) <= set(environments) and set(self.variants) <= set(variants)
+    def is_within(self, environments: Mapping[str, Sequence[str]]) -> bool:
+        """Whether a study of these, each with its variants, has all that the table has."""
+        return all(set(self.variants) <= {*environments.get(env, ())} for env in self.values)
 
 
 class Table2Config(Section):
@@ -143,22 +143,29 @@ class ClaimsConfig(Section):
     families: dict[str, FamilyConfig] = Field(default={})
 
     def lacking(
-        self, environments: Iterable[str], variants: Iterable[str], settings: MetricsConfig
+        self, environments: Mapping[str, Sequence[str]], settings: MetricsConfig
     ) -> dict[str, list[str]]:
         """By family, what its parts need and a study of these lacks: if nothing, it is judged.
 
-        Parts of returns have their margin by `metrics.reference_return` of their environments.
+        environments: each with its variants. Parts of returns have their margin by
+        `metrics.reference_return` of their environments.
         """
         goal = "metrics.reference_return.{}".format
-        has = {*environments, *variants, *CORRELATIONS, *map(goal, settings.reference_return)}
-        has.update(metric.name for metric in all_metrics(settings))
+        measured = {*CORRELATIONS, *(metric.name for metric in all_metrics(settings))}
         found = {}
         for title, family in self.families.items():
-            needed, goals = [], []
-            for _, one in parts_of(family):
-                needed += [*one.environments, one.variant, *one.over, one.metric]
-                goals += [goal(env) for env in one.environments if env in has]
-            found[title] = [name for name in dict.fromkeys([*needed, *goals]) if name not in has]
+            missing, goals = [], []
+            for _, part in parts_of(family):
+                here = [env for env in part.environments if env in environments]
+                missing += [env for env in part.environments if env not in here]
+                missing += [
+                    variant
+                    for variant in (part.variant, *part.over)
+                    if any(variant not in environments[env] for env in here)
+                ]
+                missing += [part.metric] if part.metric not in measured else []
+                goals += [goal(env) for env in here if env not in settings.reference_return]
+            found[title] = list(dict.fromkeys([*missing, *goals]))
         return found
 
 
@@ -216,7 +223,7 @@ def _check_names(claims: ClaimsConfig, study: "Study") -> None:
     """Refuse a metric, variant, environment, way or setting that there is not."""
     from mace_rl.environments import registered  # Gymnasium, which tables do without
 
-    measured = all_metrics(study.metrics.within(study.environments, study.variants))
+    measured = all_metrics(study.metrics.within(study.variants_of))
     metrics = [metric.name for metric in (*METRICS, *measured)]
     own = {*study.environments, *study.environment_settings}
     known: dict[str, tuple[Iterable[str], str]] = {

@@ -40,10 +40,8 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
 
     One `Comparison` per environment, metric that is compared and configured pair of variants that
     are both there; then one per metric and pair for all environments together, if there are
-    several.
+    several and all have both.
     """
-    variants = set(table["variant"])
-    pairs = [pair for pair in settings.comparisons if variants.issuperset(pair)]
     by_environment = {
         str(env): {str(name): own for name, own in runs.sort_values("seed").groupby("variant")}
         for env, runs in table.groupby("env", sort=False)
@@ -53,7 +51,11 @@ def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         groups.append(by_environment)
     rows: list[Comparison] = []
     for environments in groups:
-        compared = [_compare(environments, pair, settings) for pair in pairs]
+        compared = [
+            _compare(environments, pair, settings)
+            for pair in settings.comparisons
+            if all(runs.keys() >= {*pair} for runs in environments.values())
+        ]
         rows.extend(chain.from_iterable(zip(*compared, strict=True)))  # metric by metric
     frame = pd.DataFrame(rows, columns=Comparison._fields)
     tested = frame["p_value"].notna()

@@ -37,7 +37,8 @@ def ledger(table: pd.DataFrame, settings: MetricsConfig, claims: ClaimsConfig) -
     table: the frame of metrics.csv with the `CORRELATIONS` asked for; seeds may differ between
     environments, not between variants.
     """
-    lacking = claims.lacking(table["env"], table["variant"], settings)
+    runs = table.groupby("env")["variant"].unique()
+    lacking = claims.lacking({str(env): list(own) for env, own in runs.items()}, settings)
     asked = [title for title in claims.families if not lacking[title]]
     return [answer for title in asked for answer in _answers(title, claims, table, settings)]
 

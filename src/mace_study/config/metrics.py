@@ -1,7 +1,7 @@
 """How runs are measured, and how Figure 1 is laid out."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
@@ -73,22 +73,27 @@ class MetricsConfig(Section):
         """The values of `GOALS`, by environment; empty for a study without them."""
         return tuple(getattr(self, key) for key in GOALS)
 
-    def incomplete(self, environments: Sequence[str], variants: Sequence[str]) -> list[str]:
+    def incomplete(self, environments: Mapping[str, Sequence[str]]) -> list[str]:
         """A line for whatever `within` leaves out for want of some environments or variants."""
         lines = []
         for key, goal in zip(GOALS, self.goals, strict=True):
             missing = [name for name in environments if name not in goal]
             if missing and len(missing) < len(environments):
                 lines.append(f"metrics.{key} is left out: it has nothing for {', '.join(missing)}")
-        missing = [name for name in self.constant_variants() if name not in variants]
+        missing = [
+            name
+            for name in self.constant_variants()
+            if not all(name in variants for variants in environments.values())
+        ]
         if missing:
             lines.append(f"metrics.constants is left out: variants lacks {', '.join(missing)}")
         return lines
 
-    def within(self, environments: Sequence[str], variants: Sequence[str]) -> "MetricsConfig":
+    def within(self, environments: Mapping[str, Sequence[str]]) -> "MetricsConfig":
         """These settings for a study of these; what `incomplete` names is left out.
 
-        Raises `ConfigError` for a goal that random actions attain.
+        environments: each with its variants. Raises `ConfigError` for a goal that random actions
+        attain.
         """
         left: dict[str, Any] = {}
         for key, goal in zip(GOALS, self.goals, strict=True):
@@ -100,7 +105,7 @@ class MetricsConfig(Section):
                         f" metrics.random_return.{name}, {self.random_return[name]!r}"
                     )
             left[key] = left[key] if len(left[key]) == len(environments) else {}
-        if not set(variants).issuperset(self.constant_variants()):
+        if not all(set(own).issuperset(self.constant_variants()) for own in environments.values()):
             left["constants"] = None
         return self.model_copy(update=left)
 

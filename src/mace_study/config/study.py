@@ -12,7 +12,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from mace_rl.config.plugins import load
 from mace_rl.config.reading import Settings, merge, read_yaml
@@ -55,13 +55,38 @@ class ShownVariant(Variant):
     imported: bool = False  # whether its runs are others', brought by `mace_study.imported`
 
 
+SEEDS = r"(\d{1,10})-(\d{1,10})"
+MOST_SEEDS = 100_000  # of one environment
+
+
+def _listed(seeds: Any) -> Any:
+    """Seeds with `FIRST-LAST` written out, alone or in a list."""
+    listed = []
+    for seed in seeds if isinstance(seeds, list) else [seeds]:
+        ends = re.fullmatch(SEEDS, seed, re.ASCII) if isinstance(seed, str) else None
+        if not ends:
+            listed.append(seed)
+            continue
+        first, last = map(int, ends.groups())
+        if not first <= last < first + MOST_SEEDS:
+            raise ValueError(f"{seed!r} should be FIRST-LAST, of at most {MOST_SEEDS} seeds")
+        listed += range(first, last + 1)
+    return listed
+
+
 Seeds = Annotated[
-    list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(once)
+    list[Annotated[int, Field(ge=0, lt=2**32)]],
+    Field(min_length=1),
+    AfterValidator(once),
+    BeforeValidator(_listed, json_schema_input_type=int | str | list[int | str]),
 ]
 
 
 class Study(RunSettings):
-    """All runs of a study, each environment × variant × seed, and how they are evaluated."""
+    """All runs of a study, each environment × variant × seed, and how they are evaluated.
+
+    Seeds are numbers, `FIRST-LAST` with both ends, or a list of these.
+    """
 
     results: Annotated[str, AfterValidator(_folder)]  # of everything that is produced
     # Whether finished runs in `results` that have other settings are set aside and trained anew.
@@ -69,7 +94,8 @@ class Study(RunSettings):
     environments: Names
     variants: Names
     seeds: Seeds
-    # Other seeds for some environments, where one run takes long.
+    # Other variants, and seeds, for some environments: where one run takes long, say.
+    environment_variants: dict[str, Names] = Field(default={})
     environment_seeds: dict[str, Seeds] = Field(default={})
     variant_settings: Mapping[str, ShownVariant]
     metrics: MetricsConfig
@@ -80,10 +106,18 @@ class Study(RunSettings):
         """Environment, variant and seed of every run, in the configured order."""
         return [
             (environment, variant, seed)
-            for environment in self.environments
-            for variant in self.variants
+            for environment, variants in self.variants_of.items()
+            for variant in variants
             for seed in self.environment_seeds.get(environment, self.seeds)
         ]
+
+    @property
+    def variants_of(self) -> dict[str, list[str]]:
+        """By environment the variants that have runs there, in the order of `variants`."""
+        wanted = {
+            env: self.environment_variants.get(env, self.variants) for env in self.environments
+        }
+        return {env: [name for name in self.variants if name in own] for env, own in wanted.items()}
 
     def trained(self) -> list[str]:
         """The variants whose runs are trained here."""
@@ -144,14 +178,21 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
         for variant, shown in study.variant_settings.items():
             for environment in () if shown.imported else trained_in:
                 study.run_config(environment, variant, 0)  # checks its settings
-        for environment in study.environment_seeds:
-            check_known(environment, known, "environment_seeds", "environments")
+        for environment, variants in study.environment_variants.items():
+            for variant in variants:
+                key = f"environment_variants.{environment}"
+                check_known(variant, study.variant_settings, key, "variant_settings")
         for environment in study.environments:
             study.metrics.random_return_in(environment)  # there has to be one
-        for key in ("random_return", *GOALS):
-            for environment in getattr(study.metrics, key):
+        by_environment = {
+            "environment_seeds": study.environment_seeds,
+            "environment_variants": study.environment_variants,
+            **{f"metrics.{key}": getattr(study.metrics, key) for key in ("random_return", *GOALS)},
+        }
+        for key, environments in by_environment.items():  # a study of others may be below
+            for environment in environments:
                 if environment not in known and ":" not in environment:
-                    check_known(environment, registered(), f"metrics.{key}", "Gymnasium's registry")
+                    check_known(environment, registered(), key, "Gymnasium's registry")
         for reference in study.metrics.custom:
             load(reference, "metrics.custom")
     except ConfigError as error:

@@ -81,7 +81,8 @@ def constants(source: Source) -> pd.DataFrame:
     roles[settings.constants.learned] = LEARNED
     areas = {key: own["area_under_curve"] for key, own in runs.groupby(["env", "variant"])}
     rows = []
-    for environment, variant in itertools.product(runs["env"].unique(), roles):
+    pairs = itertools.product(runs["env"].unique(), roles)
+    for environment, variant in (pair for pair in pairs if pair in areas):
         values = areas[environment, variant].to_numpy()
         found = values.mean(), *interval(values, settings), len(values)
         rows.append((environment, variant, roles[variant], *found))
@@ -133,6 +134,7 @@ def draw_solved(table: pd.DataFrame, look: PlotStyle) -> Figure:
     )
     wide = table.pivot(index="variant", columns="env").loc[table["variant"].unique()]
     share, text = (wide[name][table["env"].unique()] for name in ("share", "text"))
+    text = text.fillna("")  # where a variant has no runs
     with style():
         figure, (axes,) = grid(1, 1, height=0.24 * len(share) + 2 * LEGEND_HEIGHT)
         blues = seaborn.light_palette("#4a90c8", as_cmap=True)  # on which one colour can be read
