@@ -37,8 +37,8 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.finite import require_finite
-from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.torch_network import TorchNetwork
 from mace_rl.training.experience import Experience, Rollout, without_bonus
 from mace_rl.training.rollout import roll_out
 from mace_rl.training.trainer import Trainer

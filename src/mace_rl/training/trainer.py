@@ -18,12 +18,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import torch
 
 from mace_rl.agent.advantages import discounted_returns, normalised, normalised_change
 from mace_rl.agent.learner import Batch, Update
 from mace_rl.agent.policy import ActingPolicy
 from mace_rl.base.rng import Streams
+from mace_rl.base.state import saved
 from mace_rl.beta.controller import BetaGradient
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.config.run import RunConfig
@@ -175,8 +175,8 @@ class Trainer:
             "noise": self.noise.bit_generator.state,
             "environment": resuming.state_of(self.environment),
             "last_episodes": self.last_episodes.saved(),
-            "records": as_tensors(as_columns(EpisodeRecord, self.records)),
-            "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
+            "records": saved(as_columns(EpisodeRecord, self.records)),
+            "diagnostics": saved(as_columns(UpdateRecord, self.diagnostics)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -190,8 +190,3 @@ class Trainer:
         self.last_episodes.blocks = state["last_episodes"]
         self.records = as_rows(EpisodeRecord, state["records"])
         self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
-
-
-def as_tensors(columns: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    """For a checkpoint."""
-    return {name: torch.from_numpy(column) for name, column in columns.items()}
