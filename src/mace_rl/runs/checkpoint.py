@@ -9,6 +9,7 @@ import io
 import sys
 import zipfile
 from collections import OrderedDict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
 from mace_rl.base.state import SavedArray
 from mace_rl.config.section import short_repr
+from mace_rl.runs import torch_archive
 
 PLAIN = (SavedArray, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
 
@@ -27,10 +29,13 @@ class CheckpointError(Refusal, ValueError):
 
 def archive(content: dict[str, Any]) -> bytes:
     """Tensors, numbers, strings, lists and dicts as a torch archive; equal content, equal bytes."""
+    content, buffer = _unshared(content), io.BytesIO()
+    if "torch" not in sys.modules:  # so there are no tensors but `SavedArray`s
+        with suppress(KeyError, OverflowError):
+            return torch_archive.archive(content)
     import torch
 
-    buffer = io.BytesIO()
-    torch.save(_unshared(content), buffer)
+    torch.save(content, buffer)
     return buffer.getvalue()
 
 
