@@ -42,20 +42,28 @@ class CompiledMetaNetwork(Stateful):
     STATE = ("optimiser",)  # it holds the weights
 
     def __init__(self, config: MetaConfig, inputs: int, generator: np.random.Generator) -> None:
-        vector = initial_weights(inputs, config.hidden_units, generator)
-        self.decay, shape = config.output_decay, (inputs, config.hidden_units)
-        self.weights = MetaNetwork.of(vector, *shape)
+        units, self.decay = config.hidden_units, config.output_decay
+        vector = initial_weights(inputs, units, generator)
+        self.weights = MetaNetwork.of(vector, inputs, units)
         self.optimiser = Adam(vector, config.learning_rate, config.max_gradient_norm)
         self.gradient = np.empty_like(vector)
-        self.gradients = MetaNetwork.of(self.gradient, *shape)
+        self.gradients = MetaNetwork.of(self.gradient, inputs, units)
 
     def output(self, sequence: np.ndarray) -> float:
         return float(lstm_output(sequence, self.weights))
 
     def learn(self, sequences: list[np.ndarray], slope: float) -> None:
         steps, ends = np.concatenate(sequences), np.cumsum([len(each) for each in sequences])
-        where = self.weights, self.gradient, self.gradients, self.optimiser.state
-        descend(steps, ends, f32(slope), f32(self.decay), *where)
+        descend(
+            steps,
+            ends,
+            f32(slope),
+            f32(self.decay),
+            self.weights,
+            self.gradient,
+            self.gradients,
+            self.optimiser.state,
+        )
 
 
 @kernel
@@ -69,7 +77,7 @@ def descend(steps, ends, slope, decay, weights, gradient, gradients, adam):
     for end in ends:
         sequence = steps[first:end]
         states = lstm_states(sequence, weights)
-        own = (decay * read_out(states[2], weights) + slope) / f32(len(ends))
-        add_gradient(sequence, states, weights, own, gradients)
+        grad_output = (decay * read_out(states[2], weights) + slope) / f32(len(ends))
+        add_gradient(sequence, states, weights, grad_output, gradients)
         first = end
     step(gradient, adam)

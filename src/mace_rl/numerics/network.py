@@ -74,14 +74,19 @@ class CompiledMLP:
 
         trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
         """
-        given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        return kernels.network_gradient(*given)[0]
+        return self._gradients(trace, grad_outputs)[0]
 
     def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same, and the gradient with respect to the inputs, [N, in]."""
-        given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        gradient, first = kernels.network_gradient(*given)
+        gradient, first = self._gradients(trace, grad_outputs)
         return gradient, kernels.input_gradient(first, self.parameters, self.sizes)
+
+    def _gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # With respect to the parameters, and at the first layer.
+        inputs, activations = trace.saved
+        return kernels.network_gradient(
+            inputs, activations, self.parameters, grad_outputs, self.sizes
+        )
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""

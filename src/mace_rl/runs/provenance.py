@@ -63,11 +63,11 @@ class ProvenanceError(Refusal, ValueError):
 def identity(config: RunConfig) -> dict[str, Any]:
     """Equal identities give equal results, and continue each other's checkpoints."""
     named = config.references().items()
-    own = (file for key, name in named for file in source_files(name, key))
+    users_files = (file for key, name in named for file in source_files(name, key))
     return {
         "config": config.settings(),
         "versions": versions(config),
-        "sources": code_digest.digest("training", *own),  # the user's own code included
+        "sources": code_digest.digest("training", *users_files),
     }
 
 

@@ -74,12 +74,11 @@ def run(
     directory.mkdir(parents=True, exist_ok=True)
     if may_use_torch(config):
         import torch  # noqa: F401  (now, so that what follows sets its generator and threads)
-    own = seeded(Streams(config.seed).sequence("global"))
     with (
         exclusive(directory) as lock,
         threadpool_limits(1),
         single_threaded(),
-        own,
+        seeded(Streams(config.seed).sequence("global")),
         ExitStack() as end,
     ):
         if aside == "nothing" and finished(config, directory):

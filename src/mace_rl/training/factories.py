@@ -123,15 +123,20 @@ def intrinsic_reward(
             space, size = environment.given_space, environment.observation_size
             return CheckedBonus(Curiosity(config.memory, config.novelty, space, size, streams))
         case CustomBonus(estimator=estimator, arguments=arguments):
-            key, own = "bonus.estimator", (environment, streams["bonus"])
-            made = make(estimator, key, IntrinsicReward, False, *own, **arguments)
+            key, stream = "bonus.estimator", streams["bonus"]
+            made = make(estimator, key, IntrinsicReward, False, environment, stream, **arguments)
             return CheckedBonus(made)
 
 
 def environment(config: AgentConfig, streams: Streams) -> Environment:
     """The environment that the agent acts in."""
-    own = config.max_episode_steps, config.environment_arguments, config.wrappers
-    made = Environment(config.environment, streams.sequence("environment"), *own)
+    made = Environment(
+        config.environment,
+        streams.sequence("environment"),
+        max_episode_steps=config.max_episode_steps,
+        arguments=config.environment_arguments,
+        wrappers=config.wrappers,
+    )
     made.clips_actions = config.ppo.clip_actions
     return made
 

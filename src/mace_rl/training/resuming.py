@@ -103,7 +103,7 @@ class LastEpisodes:
         if not self.kept:
             return
         block = self.blocks[-1]
-        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+        if len(block) >= EPISODES or sum(len(played["actions"]) for played in block) >= STEPS:
             self.blocks = [block, []]
         self.blocks[-1].append({"start": state_of(environment, of_process=not self.blocks[-1])})
 
@@ -114,21 +114,21 @@ class LastEpisodes:
 
     def saved(self) -> list[list[dict[str, Any]]]:
         """For a checkpoint."""
-        for one in itertools.chain.from_iterable(self.blocks):
-            if isinstance(episode := one["outcome"], Episode):
-                one |= {"actions": saved(episode.actions), "outcome": _digest(episode)}
+        for played in itertools.chain.from_iterable(self.blocks):
+            if isinstance(episode := played["outcome"], Episode):
+                played |= {"actions": saved(episode.actions), "outcome": _digest(episode)}
         return self.blocks
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
     """What is different if a new environment plays `LastEpisodes.blocks` again; "" if nothing."""
-    for one in itertools.chain.from_iterable(blocks):
-        set_state(environment, one["start"])
+    for played in itertools.chain.from_iterable(blocks):
+        set_state(environment, played["start"])
         try:
-            episode = roll_out(environment, _Again(), one["actions"].numpy())
+            episode = roll_out(environment, _Again(), played["actions"].numpy())
         except Exception as error:  # noqa: BLE001  (whatever it raises, in a state it never had)
             return " ".join(f"{type(error).__name__}: {error}".split())
-        if _digest(episode) != one["outcome"]:
+        if _digest(episode) != played["outcome"]:
             return "other observations or rewards"
     return ""
 

@@ -148,16 +148,21 @@ class Trainer:
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
         change = normalised_change(whole, intrinsic, centred)
-        steps = rollout.observations, rollout.actions
-        gradient, of_change = learner.policy_gradients(*steps, [extrinsic, change])
+        gradient, of_change = learner.policy_gradients(
+            rollout.observations, rollout.actions, [extrinsic, change]
+        )
         of_beta = BetaGradient(learner.preconditioned(of_change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), of_beta)
 
     def ppo_update(self, rollout: Rollout) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         advantages = normalised(rollout.advantages.total, self.config.ppo.centre_advantages)
-        steps = rollout.observations, rollout.actions, rollout.log_probs
-        batch = Batch(*steps, advantages.astype(np.float32))
+        batch = Batch(
+            observations=rollout.observations,
+            actions=rollout.actions,
+            log_probs=rollout.log_probs,
+            advantages=advantages.astype(np.float32),
+        )
         update = self.ppo.update(batch, {kind: rollout.returns(kind) for kind in self.ppo.critics})
         require_learned(update, self.ppo.learner)
         for item in rollout:
