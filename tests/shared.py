@@ -28,12 +28,13 @@ from mace_rl.agent.torch_policy import Categoricals
 from mace_rl.base.files import LOCK
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
-from mace_rl.numerics.network import CompiledMLP, Network, TorchNetwork
+from mace_rl.numerics.network import CompiledMLP, Network
 from mace_rl.numerics.normaliser import Normalisation
+from mace_rl.numerics.torch_network import TorchNetwork, tanh_layers
 from mace_rl.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
-ENGINES = {"compiled": CompiledMLP, "torch": TorchNetwork}
+ENGINES = {"compiled": CompiledMLP, "torch": lambda layers: TorchNetwork(tanh_layers(layers))}
 ENVIRONMENTS = ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"]
 VARIANTS = ["ppo", "mace_fixed", "mace_full"]
 NETWORKS = ["actor", "extrinsic", "intrinsic"]

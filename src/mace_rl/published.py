@@ -37,8 +37,8 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.finite import require_finite
-from mace_rl.numerics.network import TorchNetwork
 from mace_rl.numerics.normaliser import RunningNormaliser
+from mace_rl.numerics.torch_network import TorchNetwork
 from mace_rl.training.experience import Experience, Rollout, without_bonus
 from mace_rl.training.rollout import roll_out
 from mace_rl.training.trainer import Trainer
@@ -84,8 +84,8 @@ class Critic(Actor):
         self.attention = nn.MultiheadAttention(units[-2], 8, 0.1 * dropout, batch_first=True)
 
     def forward(self, observations: Tensor) -> Tensor:
-        own = (self.backbone(observations) + self.around(observations))[:, None]
-        return self.head(self.attention(own, own, own)[0][:, 0])
+        features = (self.backbone(observations) + self.around(observations))[:, None]
+        return self.head(self.attention(features, features, features)[0][:, 0])
 
 
 class MetaNetwork(nn.Module):
@@ -284,8 +284,8 @@ class PublishedTrainer(Trainer):
             raise ConfigError(f"beta.objective is {reason}")
         self.settings, bonus = config.published, config.beta.kind != "none"
         self.curiosity = Curiosity(config.published, environment) if bonus else None
-        own = environment, config.published.dropout, streams["meta"]
-        self.controller = Meta(*own) if bonus else None
+        dropout = config.published.dropout
+        self.controller = Meta(environment, dropout, streams["meta"]) if bonus else None
         self.ppo = PPO(networks(config, environment, streams), streams["dropout"])
         self.play = self._play
 

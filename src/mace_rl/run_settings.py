@@ -21,7 +21,7 @@ from mace_rl.config.plugins import import_module, source_files
 from mace_rl.config.reading import Settings, merge, read_yaml
 from mace_rl.config.run import IDENTITY, RunConfig, unused_sections
 from mace_rl.config.section import ConfigError, Section, check, check_known, explain, short_repr
-from mace_rl.environments import registered
+from mace_rl.environments import registered, spec_of
 
 # Environments and variants name folders and appear in Snakemake's patterns. An environment may have
 # more, as in Gymnasium: package.module:Namespace/Id.
@@ -195,7 +195,7 @@ def _registered(config: RunConfig) -> EnvSpec:
     if ":" in name:
         import_module(name, key)  # which registers it
     own = name.rpartition(":")[2]
-    if own not in registered():
+    if spec_of(own) is None:
         for part, package, extra in PACKAGES:
             if part in own and importlib.util.find_spec(package) is None:
                 raise ConfigError(
@@ -204,7 +204,7 @@ def _registered(config: RunConfig) -> EnvSpec:
                 )
         hint = "" if ":" in name else f" (if a module registers it: module:{name})"
         check_known(own, registered(), key, f"Gymnasium's registry{hint}")
-    spec = registered()[own]
+    spec = gymnasium.registry[own]
     if isinstance(spec.entry_point, str):
         try:  # imports the packages around the environment's module, not that module
             importlib.util.find_spec(spec.entry_point.partition(":")[0])

@@ -13,17 +13,29 @@ from shared import LAYER_NORM, laid_out
 from extras.pretrained.rule import WEIGHTS
 from mace_rl.agent.custom import custom_module
 from mace_rl.beta.lstm import MetaNetwork, lstm_output, read_network
-from mace_rl.bonus.density import CompiledAutoencoder, MaskedAutoencoder
+from mace_rl.bonus.density import CompiledAutoencoder
+from mace_rl.bonus.torch_density import MaskedAutoencoder
 from mace_rl.config.section import ConfigError
 from mace_rl.numerics.arrays import shuffled
-from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
+from mace_rl.numerics.network import CompiledMLP, mlp
+from mace_rl.numerics.torch_network import TorchNetwork, tanh_layers
 
-# Compiled form, torch module from a generator, shape of the inputs.
-CASES = []
-for hidden in ([1], [5], [64, 64], [3, 4, 5]):
-    CASES.append((CompiledMLP, partial(mlp, [6, *hidden, 3], 1.0), (20, 6)))
-for size in (1, 2, 15):
-    CASES.append((CompiledAutoencoder, partial(MaskedAutoencoder, size, 16), (20, size)))
+
+def both_mlps(hidden: list[int], seed: int) -> tuple[CompiledMLP, torch.nn.Module]:
+    layers = mlp([6, *hidden, 3], 1.0, np.random.default_rng(seed))
+    return CompiledMLP(layers), tanh_layers(layers)
+
+
+def both_autoencoders(size: int, seed: int) -> tuple[CompiledMLP, torch.nn.Module]:
+    generators = map(np.random.default_rng, (seed, seed))
+    kinds = CompiledAutoencoder, MaskedAutoencoder
+    made, module = (kind(size, 16, own) for kind, own in zip(kinds, generators, strict=True))
+    return made, module
+
+
+# Compiled form and torch module from a seed, shape of the inputs.
+CASES = [(partial(both_mlps, hidden), (20, 6)) for hidden in ([1], [5], [64, 64], [3, 4, 5])]
+CASES += [(partial(both_autoencoders, size), (20, size)) for size in (1, 2, 15)]
 
 
 def drawn(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -31,11 +43,13 @@ def drawn(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return rng.standard_normal(shape).astype(np.float32)
 
 
-@pytest.mark.parametrize(("compiled", "make", "shape"), CASES)
-def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, shape):
+@pytest.mark.parametrize(("make", "shape"), CASES)
+def test_compiled_networks_equal_autograd_in_double_precision(make, shape):
     """Outputs and gradients with arbitrary weights, biases included, to float32's rounding."""
     rng = np.random.default_rng(0)
-    module = make(rng)
+    one, module = make(0)
+    same = zip(one.module().parameters(), module.parameters(), strict=True)
+    assert all(torch.equal(*pair) for pair in same)
     with torch.no_grad():
         for part in module.parameters():
             free = (part != 0) | (part.ndim == 1)  # masked weights stay 0
@@ -50,7 +64,10 @@ def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, sh
     grad_outputs = rng.standard_normal(expected.shape)
     loss = (expected * torch.from_numpy(grad_outputs)).sum()
     gradients = [g.numpy() for g in torch.autograd.grad(loss, double.parameters())]
-    one = compiled(copy.deepcopy(module))
+    layers = zip(*2 * [iter(module.parameters())], strict=True)  # weights and biases in turn
+    for mine, theirs in zip(one.layers(one.parameters), layers, strict=True):
+        for own, part in zip(mine, theirs, strict=True):
+            own[:] = part.detach().numpy().T
     trace = one.forward(inputs)
     np.testing.assert_allclose(trace.outputs, expected.detach(), rtol=1e-4, atol=2e-5)
     one.backward(trace, np.ones_like(trace.outputs))  # it may go back more than once
@@ -60,7 +77,7 @@ def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, sh
     assert found.dtype == trace.outputs.dtype == one.parameters.dtype == np.float32
     added = laid_out(one, [np.ones_like(part) for part in gradients]) == 0
     assert (found[added] == 0).all() and (one.parameters[added] == 0).all()
-    if compiled is CompiledMLP:
+    if type(one) is CompiledMLP:
         seen = torch.from_numpy(inputs).double().requires_grad_()
         (double(seen) * torch.from_numpy(grad_outputs)).sum().backward()
         again, inward = one.gradients(trace, grad_outputs.astype(np.float32))
@@ -69,7 +86,7 @@ def test_compiled_networks_equal_autograd_in_double_precision(compiled, make, sh
         np.testing.assert_allclose(inward, seen.grad, rtol=1e-3, atol=tolerance)
         assert inward.dtype == np.float32
     assert found.shape == one.parameters.shape == flat.shape
-    other = compiled(make(np.random.default_rng(1)))
+    other, _ = make(1)
     held = other.parameters
     other.load_module_state(copy.deepcopy(one.module().state_dict()))
     assert (other.parameters == one.parameters).all() and other.parameters is held
@@ -87,14 +104,13 @@ def test_parameters_in_another_precision_are_refused():
 @pytest.mark.parametrize("sizes", [[4, 64, 64, 2], [15, 64, 64, 3], [64, 8, 64, 1]])
 @pytest.mark.parametrize("output_gain", [0.01, 1.0])
 def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
-    layers = list(mlp(sizes, output_gain, np.random.default_rng(0)))[::2]
-    for layer in layers:
-        gain = output_gain if layer is layers[-1] else math.sqrt(2)
-        weights = layer.weight.detach().double().numpy()
+    layers = mlp(sizes, output_gain, np.random.default_rng(0))
+    for weights, biases in layers:
+        gain = output_gain if weights is layers[-1][0] else math.sqrt(2)
         small = weights if weights.shape[0] <= weights.shape[1] else weights.T
         expected = gain**2 * np.eye(len(small))
         np.testing.assert_allclose(small @ small.T, expected, atol=1e-6 * gain**2)
-        assert (layer.bias == 0).all()
+        assert (biases == 0).all()
 
 
 @pytest.mark.parametrize("length", [1, 40])

@@ -12,7 +12,8 @@ from mace_rl.beta.controller import BetaGradient
 from mace_rl.beta.credit import Evidence
 from mace_rl.beta.lstm import MetaNetwork, add_gradient, lstm_output, lstm_states
 from mace_rl.beta.meta import MetaAdaptation
-from mace_rl.beta.network import CompiledMetaNetwork, TorchMetaNetwork
+from mace_rl.beta.network import CompiledMetaNetwork
+from mace_rl.beta.torch_network import TorchMetaNetwork
 from mace_rl.environments.episode import Episode
 from mace_rl.training.factories import beta_controller
 

@@ -1,6 +1,5 @@
 """Pages: the examples of docs/extending.md and docs/wrappers.md as they stand, examples/; links."""
 
-import json
 import re
 import runpy
 import shlex
@@ -16,7 +15,7 @@ from shared import ROOT, call, refusal
 
 from mace_rl.library import settings
 from mace_rl.runs.agent import load_agent
-from mace_rl.training.records import read_episodes
+from mace_rl.runs.finished import FinishedRun
 from mace_study.compare.claims_config import read_claims
 from mace_study.compare.summary import split, summary
 from mace_study.compare.verdicts import ledger
@@ -71,8 +70,7 @@ def test_every_example_is_one_file_and_one_entry():
 @pytest.mark.parametrize("name", TRAININGS)
 def test_example_trains(folder, train, name):
     assert train(name) == (0, "")
-    record = json.loads((folder / name / "run.json").read_text(encoding="utf-8"))
-    episodes = read_episodes(folder / name / "episodes.csv", record["config"]["episodes"])
+    episodes = FinishedRun(folder / name).episodes
     assert len(episodes) >= 5
     match name:
         case "layer_norm":  # policy and two critics

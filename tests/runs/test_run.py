@@ -244,7 +244,7 @@ def test_a_process_of_its_own_is_killed_and_resumed_by_another(
         finally:
             process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
-    assert {"numpy", "scipy"} < {Path(library).parts[-2].partition(".")[0] for library in threads}
+    assert {"numpy", "scipy"} <= {Path(library).parts[-2].partition(".")[0] for library in threads}
     assert set(threads.values()) == {1}
     assert {*map(Path, imported)} <= {*code_digest.files("training")}
     assert {Path(name).name for name in imported} >= {"trainer.py", "ppo.py", "run.py"}

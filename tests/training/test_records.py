@@ -1,8 +1,8 @@
 """The contract of episodes.csv: it comes back to the bit, and what is damaged is refused."""
 
-import hashlib
 import os
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from invented import episode_columns
 from shared import refused
 
 from mace_rl.base.tables import RecordError
+from mace_rl.runs.finished import FinishedRun
 from mace_rl.training.records import read_episodes, write_episodes
 
 HEADER = "episode,env_steps,length,extrinsic_return,intrinsic_return,beta,terminated"
@@ -30,11 +31,14 @@ def text(rows=ROWS, header=HEADER):
 def test_doubles_and_integers_come_back_to_the_bit(tmp_path):
     written = columns(1000)
     write_episodes(tmp_path / "episodes.csv", written)
-    frame = read_episodes(tmp_path / "episodes.csv", 1000)
-    assert list(frame.columns) == HEADER.split(",")
-    for name, values in written.items():
-        assert frame[name].dtype == values.dtype
-        assert frame[name].to_numpy().tobytes() == values.tobytes()
+    content = (tmp_path / "episodes.csv").read_bytes()
+    for read in (
+        read_episodes(tmp_path / "episodes.csv", 1000, known) for known in (None, content)
+    ):
+        assert list(read) == HEADER.split(",")
+        for name, values in written.items():
+            assert read[name].dtype == values.dtype
+            assert read[name].tobytes() == values.tobytes()
 
 
 DAMAGE = {  # what the file holds, and what the message must name
@@ -67,23 +71,21 @@ def test_a_damaged_file_is_refused_with_its_line(damage, tmp_path):
         read_episodes(path, 3)
 
 
-def test_what_run_json_does_not_describe_is_refused(tmp_path):
+@pytest.mark.parametrize("part", ["episodes", "rows"])
+def test_what_run_json_does_not_describe_is_refused(part, trained, tmp_path):
     """Plausible, but altered; and where the damage has a line, that is named."""
-    path = tmp_path / "e.csv"
-    path.write_text(text())
-    frame = read_episodes(path, 3)
-    assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
-    write_episodes(tmp_path / "again.csv", {name: frame[name].to_numpy() for name in frame})
-    assert (tmp_path / "again.csv").read_text() == text()
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert read_episodes(path, 3, digest).equals(read_episodes(path, 3))
-    path.write_text(text().replace("9.5", "9.75"))
-    assert len(read_episodes(path, 3)) == 3
-    with pytest.raises(RecordError, match=r"e\.csv: missing, cut off or altered"):
-        read_episodes(path, 3, digest)
-    path.write_text(text().replace("9.5", "x"))
-    with pytest.raises(RecordError, match="line 2: extrinsic_return is 'x'"):
-        read_episodes(path, 3, digest)
+    path = shutil.copytree(trained(episodes=3), tmp_path / "run") / "episodes.csv"
+    whole = path.read_text()
+    columns = FinishedRun(tmp_path / "run").columns
+    write_episodes(tmp_path / "again.csv", columns)
+    assert (tmp_path / "again.csv").read_text() == whole
+    frame = FinishedRun(tmp_path / "run").episodes
+    assert frame.to_dict("list") == {name: values.tolist() for name, values in columns.items()}
+    cell = f",{columns['extrinsic_return'][0]},"
+    for other, said in ((",9.75,", "missing, cut off or altered"), (",x,", "line 2: .* is 'x'")):
+        path.write_text(whole.replace(cell, other, 1))
+        with pytest.raises(RecordError, match=rf"episodes\.csv: {said}"):
+            getattr(FinishedRun(tmp_path / "run"), part)
 
 
 def test_every_cut_is_refused(tmp_path):

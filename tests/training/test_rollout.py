@@ -29,8 +29,8 @@ def bits(episode: Episode) -> list[tuple]:
 
 
 def new_policy(environment: Environment, hidden, rng, log_std=0.0, engine="compiled") -> Policy:
-    module = mlp([environment.observation_size, *hidden, environment.action_size], 0.01, rng)
-    return Policy(ENGINES[engine](module), environment.actions, log_std)
+    layers = mlp([environment.observation_size, *hidden, environment.action_size], 0.01, rng)
+    return Policy(ENGINES[engine](layers), environment.actions, log_std)
 
 
 def uniform_policy(environment: Environment, **settings) -> ActingPolicy:

@@ -76,12 +76,18 @@ class CompiledLearner(Stateful):
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
         observations = np.ascontiguousarray(observations, np.float32)
-        network, parameters, several = self.network, self.policy.parameters, np.stack(advantages)
-        parts = self.policy.parts
-        found = policy_gradients(observations, actions, several, parameters, network.sizes, parts)
+        parameters = self.policy.parameters
+        gradients = policy_gradients(
+            observations,
+            actions,
+            np.stack(advantages),
+            parameters,
+            self.network.sizes,
+            self.policy.parts,
+        )
         if not self.config.learn_log_std:
-            found[:, len(parameters) - len(self.policy.log_std) :] = 0
-        return list(found)
+            gradients[:, len(parameters) - len(self.policy.log_std) :] = 0
+        return list(gradients)
 
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
         return self.optimisers["actor"].preconditioned(direction)
@@ -106,7 +112,7 @@ def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_lo
         for end in minibatches.ends:
             back = transposed(parameters, sizes)
             gradient[:] = 0
-            own, share = log_std_part(gradient, sizes), -1 / (end - first)
+            grad_log_std, share = log_std_part(gradient, sizes), -1 / (end - first)
             for start in range(first, end, BLOCK):
                 stop = min(start + BLOCK, end)
                 chosen, new = order[start:stop], new_log_probs[start:stop]
@@ -116,11 +122,17 @@ def update_policy(steps, minibatches, sizes, clip, entropy_coefficient, learn_lo
                 new[:] = log_probs(outputs, log_std, actions, parts)
                 weights = surrogate_weights(new, steps, chosen, clip, share)
                 grad, entropies[start:stop] = log_prob_gradient(
-                    outputs, log_std, actions, weights, share * entropy_coefficient, own, parts
+                    outputs,
+                    log_std,
+                    actions,
+                    weights,
+                    share * entropy_coefficient,
+                    grad_log_std,
+                    parts,
                 )
                 backward(observations, activations, grad, back, sizes, gradient, scratch)
             if not learn_log_std:
-                own[:] = 0
+                grad_log_std[:] = 0
             norm = step(gradient, adam)
             first = end
     old_log_probs = gather(steps.log_probs, minibatches.epochs[-1])
@@ -163,9 +175,9 @@ def policy_gradients(observations, actions, advantages, parameters, sizes, parts
         states, chosen = observations[start:end], actions[start:end]
         outputs = forward(states, parameters, sizes, activations)[:, : sizes[-1]]
         for k in range(len(weights)):
-            own = log_std_part(gradients[k], sizes)
+            grad_log_std = log_std_part(gradients[k], sizes)
             grad, _ = log_prob_gradient(
-                outputs, log_std, chosen, weights[k, start:end], 0.0, own, parts
+                outputs, log_std, chosen, weights[k, start:end], 0.0, grad_log_std, parts
             )
             backward(states, activations, grad, back, sizes, gradients[k], scratch)
     return gradients

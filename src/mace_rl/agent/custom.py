@@ -25,9 +25,9 @@ def custom_module(
     """
     with torch.random.fork_rng(devices=[]), as_torch_begins():
         torch.manual_seed(int(generator.integers(2**63)))
-        key, given = "ppo.network.module", (inputs, outputs, hidden_units)
+        key, name, arguments = "ppo.network.module", settings.module, settings.arguments
         kind = torch.nn.Module
-        module = make(settings.module, key, kind, True, *given, **settings.arguments).float()
+        module = make(name, key, kind, True, inputs, outputs, hidden_units, **arguments).float()
         trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
         shapes = [tuple(module(trial).shape), (2, outputs)]
         same = torch.equal(module(trial), module(trial))

@@ -83,16 +83,16 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
         for j in range(len(parts)):
             end = first + parts[j]
             for n in range(len(actions)):
-                logits, own = outputs[n, first:end], grad[n, first:end]
+                logits, grad_logits = outputs[n, first:end], grad[n, first:end]
                 log_total, entropy = log_sum_exp(logits), f32(0)
                 for i in range(len(logits)):
-                    own[i] = exp(logits[i] - log_total)
-                    entropy -= own[i] * (logits[i] - log_total)
+                    grad_logits[i] = exp(logits[i] - log_total)
+                    entropy -= grad_logits[i] * (logits[i] - log_total)
                 entropies[n] += entropy
                 for i in range(len(logits)):
                     log_prob = logits[i] - log_total
-                    own[i] *= -(weights[n] + entropy_weight * (log_prob + entropy))
-                own[int(actions[n, j])] += weights[n]
+                    grad_logits[i] *= -(weights[n] + entropy_weight * (log_prob + entropy))
+                grad_logits[int(actions[n, j])] += weights[n]
             first = end
     else:
         entropies[:] = 0

@@ -69,4 +69,5 @@ class Learner(Protocol):
 
 def parameters_of(policy: Policy, critics: Mapping[str, Network]) -> dict[str, np.ndarray]:
     """Those of "actor" and of each critic, float32 [n]: the same memory."""
-    return {"actor": policy.parameters} | {kind: own.parameters for kind, own in critics.items()}
+    networks = {kind: critic.parameters for kind, critic in critics.items()}
+    return {"actor": policy.parameters} | networks

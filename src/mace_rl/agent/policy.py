@@ -31,9 +31,9 @@ class Policy:
     def __init__(self, network: Network, actions: Actions, initial_log_std: float) -> None:
         self.network = network
         self.discrete, self.parts = actions.discrete, actions.parts
-        own = actions.outputs if actions.continuous else 0
+        deviations = actions.outputs if actions.continuous else 0
         count = len(network.parameters)
-        self.parameters = np.full(count + own, initial_log_std, np.float32)
+        self.parameters = np.full(count + deviations, initial_log_std, np.float32)
         network.move_to(self.parameters[:count])
         self.log_std = self.parameters[count:]  # float32 [actions]; empty unless they are Box ones
 
@@ -98,8 +98,16 @@ class CompiledActing(NamedTuple):
         normalisation: Normalisation,
     ) -> "CompiledActing":
         """With this network."""
-        own = network.parameters, network.sizes, log_std, parts
-        return cls(normalisation, *own, *network.scratch)
+        seen, activations = network.scratch
+        return cls(
+            normalisation=normalisation,
+            parameters=network.parameters,
+            sizes=network.sizes,
+            log_std=log_std,
+            parts=parts,
+            seen=seen,
+            activations=activations,
+        )
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         sample = act_box if len(self.log_std) else act_parts if len(self.parts) else act_discrete

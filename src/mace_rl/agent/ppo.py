@@ -94,8 +94,9 @@ class PPO(ActorCritic, Stateful):
             self.reward_scales[kind].update(rewards)
         ends = terminated or not self.config.bootstrap_at_time_limit
         unit, values = self.reward_scale(kind), self.critics[kind].outputs(observations)
-        discounts = self.config.discount, self.config.gae_lambda
-        advantages, returns = episode_advantages(rewards, unit, values, ends, *discounts)
+        advantages, returns = episode_advantages(
+            rewards, unit, values, ends, self.config.discount, self.config.gae_lambda
+        )
         self.advantage_scales[kind].update(advantages)
         require_finite(f"an advantage or value of the {kind} reward", advantages)
         return Evaluation(advantages, returns, self.advantage_scale(kind))

@@ -29,7 +29,7 @@ class Categoricals(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         each = zip(self.each, value.unbind(-1), strict=True)
-        return torch.stack([part.log_prob(own) for part, own in each], -1).sum(-1)
+        return torch.stack([part.log_prob(choice) for part, choice in each], -1).sum(-1)
 
     def entropy(self) -> Tensor:
         return torch.stack([part.entropy() for part in self.each], -1).sum(-1)
@@ -69,14 +69,14 @@ class TorchPolicy(torch.nn.Module):
         self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
     ) -> list[np.ndarray]:
         log_probs = self(from_numpy(observations)).log_prob(from_numpy(actions))
-        found = []
+        gradients = []
         for item in advantages:
             mean = (log_probs * from_numpy(item.astype(np.float32))).mean()
             parts = torch.autograd.grad(
                 mean, self.weights(), retain_graph=True, materialize_grads=True
             )
-            found.append(torch.cat([part.ravel() for part in parts]).numpy())
-        return found
+            gradients.append(torch.cat([part.ravel() for part in parts]).numpy())
+        return gradients
 
     def weights(self) -> list[Tensor]:
         """Its parameters, in the order of `Policy.parameters`."""

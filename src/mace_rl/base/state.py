@@ -6,7 +6,22 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import torch
+
+
+class SavedArray(np.ndarray):
+    """An array of a state: in a file it is a tensor, and either gives its numbers by `numpy`.
+
+    Without it, every training would need torch, which takes it seconds and 200 MB to import.
+    """
+
+    def numpy(self) -> np.ndarray:
+        """The same memory as an ordinary array."""
+        return self.view(np.ndarray)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:  # for torch.save
+        import torch
+
+        return torch.from_numpy(self.numpy()).__reduce_ex__(protocol)
 
 
 class HasState(ABC):
@@ -43,7 +58,7 @@ def saved(value: Any) -> Any:
     """A copy of `value` for a checkpoint."""
     match value:
         case np.ndarray():
-            return torch.from_numpy(value.copy())
+            return value.copy().view(SavedArray)
         case np.random.Generator():
             return value.bit_generator.state
         case Stateful():
@@ -63,12 +78,12 @@ def restored(current: Any, state: Any) -> Any:
     if hasattr(current, "load_state_dict"):
         current.load_state_dict(state)
         return current
+    if hasattr(state, "numpy"):  # a tensor, or a `SavedArray`
+        if not isinstance(current, np.ndarray) or current.shape != tuple(state.shape):
+            return state.numpy().copy()
+        current[...] = state.numpy()
+        return current
     match state:
-        case torch.Tensor():
-            if not isinstance(current, np.ndarray) or current.shape != state.shape:
-                return state.numpy().copy()
-            current[...] = state.numpy()
-            return current
         case dict():
             before = current or {}
             items = {name: restored(before.get(name), item) for name, item in state.items()}

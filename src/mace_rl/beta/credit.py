@@ -71,7 +71,7 @@ class Judge(Stateful):
         rms = math.sqrt(self.alignments / self.alignment_weight)
         if rms > 0:
             terms = zip(along, self.bonus_weights, strict=True)
-            added = [value / rms * min(1.0, advantage_rms) * own for value, own in terms]
+            added = [value / rms * min(1.0, advantage_rms) * weight for value, weight in terms]
             self.credits = [a + b for a, b in zip(self.credits, added, strict=True)]
 
     def bounded(self, credit: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mace_rl.base.state import Stateful
 from mace_rl.beta.controller import BetaController, BetaGradient
-from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork, TorchMetaNetwork
+from mace_rl.beta.network import CompiledMetaNetwork, LearningNetwork
 from mace_rl.beta.objectives import Lesson, Objective, Played
 from mace_rl.beta.sequence import SequenceReader
 from mace_rl.beta.squash import beta_of, logit
@@ -38,8 +38,10 @@ class MetaAdaptation(Stateful, BetaController):
         self.initial_logit, self.objective = logit(initial), objective
         self.learns = objective.asks_policy
         self.reader = SequenceReader(config, spaces)
-        kind = CompiledMetaNetwork if engine == "compiled" else TorchMetaNetwork
-        self.network: LearningNetwork = kind(config, self.reader.inputs, generator)
+        kind: type[LearningNetwork] = CompiledMetaNetwork
+        if engine == "torch":
+            from mace_rl.beta.torch_network import TorchMetaNetwork as kind
+        self.network = kind(config, self.reader.inputs, generator)
         self.sequence: np.ndarray | None = None  # what was read for the next β
         self.asked: tuple[np.ndarray, float, float] | None = None  # what was read, o and β
 

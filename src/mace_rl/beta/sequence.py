@@ -44,9 +44,9 @@ class SequenceReader(Stateful):
         seen = episode.observations.shape[1]
         rows = stretches(episode.observations, actions, episode.rewards, bonus, self.config.chunks)
         self.normaliser.update(rows)
-        found = standardised(rows, self.normaliser.mean, self.normaliser.std, CLIP)
-        found[:, :seen] /= np.float32(math.sqrt(seen))  # so that many weigh no more than few
-        return found
+        sequence = standardised(rows, self.normaliser.mean, self.normaliser.std, CLIP)
+        sequence[:, :seen] /= np.float32(math.sqrt(seen))  # so that many weigh no more than few
+        return sequence
 
 
 @kernel

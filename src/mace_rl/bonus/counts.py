@@ -64,10 +64,10 @@ class HashedCountNovelty(Stateful, Novelty):
         return self.continued(states, {})
 
     def continued(self, states: np.ndarray, visits: Mapping[bytes, int]) -> np.ndarray:
-        own, novelty = Counter[bytes](), np.empty(len(states))
+        seen, novelty = Counter[bytes](), np.empty(len(states))
         for t, state in enumerate(map(np.ndarray.tobytes, states)):
-            own[state] += 1
-            novelty[t] = 1 / (self.count(hashed(state)) + visits.get(state, 0) + own[state])
+            seen[state] += 1
+            novelty[t] = 1 / (self.count(hashed(state)) + visits.get(state, 0) + seen[state])
         return novelty
 
     def count(self, key: bytes) -> float:
@@ -80,9 +80,9 @@ class HashedCountNovelty(Stateful, Novelty):
             self.warned = True
             logger.warning("whole numbers of 2^24 and more are not told apart, but count as one")
         visits = Counter(map(np.ndarray.tobytes, states))
-        found = {(key := hashed(state)): self.count(key) + n for state, n in visits.items()}
+        counts = {(key := hashed(state)): self.count(key) + n for state, n in visits.items()}
         self.episodes += 1
-        self.known |= {key: (count * self.decay, self.episodes) for key, count in found.items()}
+        self.known |= {key: (count * self.decay, self.episodes) for key, count in counts.items()}
 
     @property
     def keys(self) -> np.ndarray:

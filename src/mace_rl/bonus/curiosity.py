@@ -153,8 +153,8 @@ def novelty_of(
         case "density" if not isinstance(space, Discrete):
             return DensityNovelty(config, normaliser, streams)
         case "custom" if config.estimator is not None:
-            key, given = "novelty.estimator", (size, streams["novelty"])
-            return make(config.estimator, key, Novelty, False, *given, **config.arguments)
+            key, stream = "novelty.estimator", streams["novelty"]
+            return make(config.estimator, key, Novelty, False, size, stream, **config.arguments)
     raise ConfigError(
         f"novelty.kind is {kind!r}, but the observations are {space}: 'counts' is for Discrete"
         " ones and whole numbers, 'density' for all but Discrete"

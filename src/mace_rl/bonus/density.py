@@ -1,51 +1,41 @@
 """Neural density estimator: a masked autoencoder, MADE (Germain et al. 2015), Gaussian outputs."""
 
 import numpy as np
-import torch
-from torch.nn.functional import linear
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import HALF_LOG_TAU, exp
-from mace_rl.numerics.network import CompiledMLP, Trace, mlp
+from mace_rl.numerics.network import CompiledMLP, Layers, Trace, mlp
 
 SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
 
 
-class MaskedAutoencoder(torch.nn.Module):
-    """μ_i and log σ_i, functions of the inputs before the i-th: [N, size] → [N, 2 size].
+def masked_layers(
+    size: int, hidden_units: int, generator: np.random.Generator
+) -> tuple[Layers, tuple[np.ndarray, np.ndarray]]:
+    """New layers of a masked autoencoder, and the masks of their weights, [in, out] each.
 
-    One hidden layer with tanh. Masked weights start at 0, and their gradient is 0.
+    It maps [N, size] to [N, 2 size]: μ_i and log σ_i, functions of the inputs before the i-th, with
+    one hidden layer and tanh. Masked weights start at 0, and their gradient is 0.
     """
-
-    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
-        super().__init__()
-        layers = mlp([size, hidden_units, 2 * size], 0.1, generator)
-        self.hidden, self.output = (part for part in layers if isinstance(part, torch.nn.Linear))
-        # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
-        degrees = torch.arange(hidden_units, device="cpu") % max(size - 1, 1) + 1
-        coordinates = torch.arange(1, size + 1, device="cpu")
-        inward = degrees[:, None] >= coordinates
-        outward = (coordinates[:, None] > degrees).repeat(2, 1)
-        self.masks = inward.float(), outward.float()
-        with torch.no_grad():
-            for layer, mask in zip((self.hidden, self.output), self.masks, strict=True):
-                layer.weight *= mask
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """μ, then log σ, not bounded yet."""
-        inward, outward = self.masks
-        hidden = torch.tanh(linear(x, self.hidden.weight * inward, self.hidden.bias))
-        return linear(hidden, self.output.weight * outward, self.output.bias)
+    # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
+    degrees = np.arange(hidden_units) % max(size - 1, 1) + 1
+    coordinates = np.arange(1, size + 1)
+    inward = (coordinates[:, None] <= degrees).astype(np.float32)
+    outward = np.tile(degrees[:, None] < coordinates, 2).astype(np.float32)
+    hidden, output = mlp([size, hidden_units, 2 * size], 0.1, generator)
+    layers = [(hidden[0] * inward, hidden[1]), (output[0] * outward, output[1])]
+    return layers, (inward, outward)
 
 
 class CompiledAutoencoder(CompiledMLP):
-    """`MaskedAutoencoder` in compiled code."""
+    """`torch_density.MaskedAutoencoder` in compiled code."""
 
-    def __init__(self, module: MaskedAutoencoder) -> None:
-        super().__init__(torch.nn.Sequential(module.hidden, torch.nn.Tanh(), module.output))
+    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
+        layers, masks = masked_layers(size, hidden_units, generator)
+        super().__init__(layers)
         self.mask = np.ones_like(self.parameters)
-        for (weights, _), mask in zip(self.layers(self.mask), module.masks, strict=True):
-            weights[:] = mask.numpy().T
+        for (weights, _), mask in zip(self.layers(self.mask), masks, strict=True):
+            weights[:] = mask
 
     def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
         return super().backward(trace, grad_outputs) * self.mask
@@ -55,7 +45,7 @@ class DensityEstimator:
     """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)): p integrates to 1 whatever the weights."""
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
-        self.network = CompiledAutoencoder(MaskedAutoencoder(size, hidden_units, generator))
+        self.network = CompiledAutoencoder(size, hidden_units, generator)
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, float32 [N, size] → [N]."""

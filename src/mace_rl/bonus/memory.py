@@ -1,6 +1,6 @@
 """Episodic memory: a neural dictionary (paper, supplement; Pritzel et al. 2017)."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -8,6 +8,25 @@ from mace_rl.base.state import Stateful
 from mace_rl.config.bonus import MemoryConfig
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.nearest import Neighbours
+
+
+class Experiences(NamedTuple):
+    """What is written, N at once."""
+
+    keys: np.ndarray  # [N, key], like the next
+    next_states: np.ndarray
+    rewards: np.ndarray  # [N], like the next
+    returns: np.ndarray
+
+
+class Entries(NamedTuple):
+    """The arrays of an `EpisodicMemory`, which has them as its attributes."""
+
+    keys: np.ndarray
+    values: np.ndarray
+    usage: np.ndarray
+    number: np.ndarray
+    read: np.ndarray
 
 
 class EpisodicMemory(Stateful):
@@ -43,9 +62,9 @@ class EpisodicMemory(Stateful):
         are stored. All that was read since the last `write` was used at the same time, before it.
         """
         self.time += 2
-        new, entries = (keys, next_states, rewards, returns), (self.keys, self.values)
-        when = self.usage, self.number, self.read, self.time, self.written
-        self.newest_first = write(new, entries, when, self.newest_first)
+        new = Experiences(keys, next_states, rewards, returns)
+        entries = Entries(self.keys, self.values, self.usage, self.number, self.read)
+        self.newest_first = write(new, entries, self.newest_first, self.time, self.written)
         self.written += min(len(keys), len(self.keys))
         self.neighbours = None
 
@@ -65,9 +84,16 @@ class EpisodicMemory(Stateful):
         if not self.neighbours:
             raise LookupError("the episodic memory is empty, or not indexed since it was written")
         count = min(self.config.neighbours, len(self.neighbours))
-        found = self.neighbours.nearest(states, count)
-        entries = self.newest_first, self.values, self.read
-        return recollect(*found, *entries, states.shape[1], self.config.kernel_bandwidth)
+        squared_distances, places = self.neighbours.nearest(states, count)
+        return recollect(
+            squared_distances,
+            places,
+            self.newest_first,
+            self.values,
+            self.read,
+            states.shape[1],
+            self.config.kernel_bandwidth,
+        )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `Stateful` says; `build_index` before the next look-up."""
@@ -77,21 +103,21 @@ class EpisodicMemory(Stateful):
 
 
 @kernel
-def write(new, entries, when, newest_first):
-    """`EpisodicMemory.write`, in its arrays; returns `newest_first` as it is then."""
-    (keys, next_states, rewards, returns), (usage, number, read, time, written) = new, when
+def write(new, entries, newest_first, time, written):
+    """`EpisodicMemory.write` of `Experiences` into `Entries`; returns the new `newest_first`."""
+    usage, number, read = entries.usage, entries.number, entries.read
     for entry in range(len(usage)):
         if read[entry]:
             usage[entry], read[entry] = time - 1, False
     # Of equally used ones the first written goes: a long episode reads nearly every entry.
     age, order = usage * 2**32 + number, np.empty(len(usage), np.int64)
-    count = min(len(keys), len(usage))
+    count = min(len(new.keys), len(usage))
     for n in range(count):
-        entry, given = np.argmin(age), len(keys) - count + n
+        entry, experience = np.argmin(age), len(new.keys) - count + n
         age[entry] = 2**62
-        key, value = entries[0][entry], entries[1][entry]
-        key[:], value[:-2] = keys[given], next_states[given]
-        value[-2], value[-1] = rewards[given], returns[given]
+        key, value = entries.keys[entry], entries.values[entry]
+        key[:], value[:-2] = new.keys[experience], new.next_states[experience]
+        value[-2], value[-1] = new.rewards[experience], new.returns[experience]
         usage[entry], number[entry] = time, written + n + 1
         order[count - 1 - n] = entry
     for entry in newest_first:

@@ -37,3 +37,12 @@ def registered() -> dict[str, EnvSpec]:
         with suppress(ImportError):
             import_module(package)
     return gymnasium.registry
+
+
+def spec_of(environment: str) -> EnvSpec | None:
+    """The entry of an environment, "module:Id" once the module is imported; None if there is none.
+
+    Packages that take long to import are only when it is not Gymnasium's own or ours.
+    """
+    name = environment.rpartition(":")[2]
+    return gymnasium.registry.get(name) or registered().get(name)

@@ -15,7 +15,7 @@ from mace_rl.base.errors import in_one_line, raised_in
 from mace_rl.base.stdio import keep_open
 from mace_rl.config.plugins import import_module, make
 from mace_rl.config.section import ConfigError, short_repr
-from mace_rl.environments import registered
+from mace_rl.environments import spec_of
 from mace_rl.environments.remembered import OWN, fractions, hold_still, remembered, restore
 from mace_rl.environments.spaces import Spaces
 
@@ -85,7 +85,7 @@ class Environment(Spaces):
         """wrappers: around the environment, the innermost first, "module:Class" and arguments."""
         if ":" in name:
             import_module(name, "environment")
-        registered()
+        spec_of(name)  # imports the package that registers it
         try:
             spec = copy.deepcopy(gymnasium.spec(name.rpartition(":")[2]))
         except gymnasium.error.Error as error:

@@ -68,8 +68,8 @@ class PlantedMixed(Planted):
         return super().reset(**kwargs)
 
     def observe(self, flag: bool) -> np.ndarray:
-        found = super().observe(flag)
-        return np.append(found[:-1], [self.flag == "right", found[-1]]).astype(np.float32)
+        planted = super().observe(flag)
+        return np.append(planted[:-1], [self.flag == "right", planted[-1]]).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
         """The kind of the episode."""

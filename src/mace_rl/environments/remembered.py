@@ -10,9 +10,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.wrappers import NormalizeReward
 from gymnasium.wrappers.utils import RunningMeanStd
+
+from mace_rl.base.state import saved
 
 OFFERED = ("state_dict", "load_state_dict")  # by an environment, or the outermost of its wrappers
 OWN = "own"  # the key of what these give
@@ -26,7 +27,7 @@ def remembered(env: Env) -> dict[str, Any]:
     if all(map(env.has_wrapper_attr, OFFERED)):
         found[OWN] = copy.deepcopy(env.get_wrapper_attr("state_dict")())
     for key, holder, name in _statistics(env):
-        found[key] = torch.from_numpy(np.array(getattr(holder, name), np.float64))
+        found[key] = saved(np.array(getattr(holder, name), np.float64))
     return found
 
 

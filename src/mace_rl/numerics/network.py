@@ -1,19 +1,21 @@
-"""Networks: one small interface, and two implementations.
+"""Networks: one small interface, and the default one, a tanh network, in compiled code.
 
-A `torch.nn.Module` defines each network. `TorchNetwork` runs any such module; `CompiledMLP` runs
-the default one, a tanh network, in compiled code.
+`torch_network` has the other implementation, which runs any torch module.
 """
 
 import math
-from collections.abc import Iterable
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-import torch
 
 from mace_rl.numerics import network_kernels as kernels
 from mace_rl.numerics.matmul import padded
+
+if TYPE_CHECKING:  # it takes seconds to import, and most trainings need nothing of it
+    import torch
+
+Layers = list[tuple[np.ndarray, np.ndarray]]  # each one's weights, [in, out], and biases
 
 
 class Network(Protocol):
@@ -27,36 +29,11 @@ class Network(Protocol):
     def move_to(self, memory: np.ndarray) -> None:
         """Keep the parameters in `memory`, float32 [n], from now on."""
 
-    def module(self) -> torch.nn.Module:
+    def module(self) -> "torch.nn.Module":
         """The same network as a torch module; it may share memory with this one."""
 
-    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
+    def load_module_state(self, state: "dict[str, torch.Tensor]") -> None:
         """Take over the parameters in the `state_dict` of such a module."""
-
-
-class TorchNetwork:
-    """A `Network` of any torch module, whose parameters become views of the flat vector."""
-
-    def __init__(self, module: torch.nn.Module) -> None:
-        self._module = module
-        vector = torch.nn.utils.parameters_to_vector(module.parameters())
-        self.move_to(vector.detach().numpy().copy())
-
-    @torch.no_grad()
-    def outputs(self, inputs: np.ndarray) -> np.ndarray:
-        return self._module(torch.from_numpy(np.array(inputs, np.float32))).numpy()
-
-    def move_to(self, memory: np.ndarray) -> None:
-        vector = torch.from_numpy(memory)
-        vector.copy_(torch.nn.utils.parameters_to_vector(self._module.parameters()).detach())
-        torch.nn.utils.vector_to_parameters(vector, self._module.parameters())  # as views
-        self.parameters = memory
-
-    def module(self) -> torch.nn.Module:
-        return self._module
-
-    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
-        self._module.load_state_dict(state)
 
 
 class Trace(NamedTuple):
@@ -69,17 +46,18 @@ class Trace(NamedTuple):
 class CompiledMLP:
     """A `Network` of `mlp` in compiled code; `network_kernels` has the layout of `parameters`."""
 
-    def __init__(self, module: torch.nn.Sequential) -> None:
-        shapes = [layer.weight.shape for layer in module if isinstance(layer, torch.nn.Linear)]
-        self.sizes = np.array([shapes[0][1], *(shape[0] for shape in shapes)])
-        count = sum((inputs + 1) * padded(outputs) for outputs, inputs in shapes)
+    def __init__(self, layers: Layers) -> None:
+        shapes = [weights.shape for weights, _ in layers]
+        self.sizes = np.array([shapes[0][0], *(shape[1] for shape in shapes)])
+        count = sum((inputs + 1) * padded(outputs) for inputs, outputs in shapes)
         self.parameters = np.zeros(count, np.float32)
         # For one input and what the layers make of it, while somebody acts.
         self.scratch = (
-            np.empty((1, shapes[0][1]), np.float32),
+            np.empty((1, shapes[0][0]), np.float32),
             kernels.activation_buffer(1, self.sizes),
         )
-        self.load_module_state(module.state_dict())
+        for (weights, biases), initial in zip(self.layers(self.parameters), layers, strict=True):
+            weights[:], biases[:] = initial
 
     def outputs(self, inputs: np.ndarray) -> np.ndarray:
         inputs = np.ascontiguousarray(inputs, np.float32)
@@ -96,14 +74,19 @@ class CompiledMLP:
 
         trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
         """
-        given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        return kernels.network_gradient(*given)[0]
+        return self._gradients(trace, grad_outputs)[0]
 
     def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same, and the gradient with respect to the inputs, [N, in]."""
-        given = *trace.saved, self.parameters, grad_outputs, self.sizes
-        gradient, first = kernels.network_gradient(*given)
+        gradient, first = self._gradients(trace, grad_outputs)
         return gradient, kernels.input_gradient(first, self.parameters, self.sizes)
+
+    def _gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # With respect to the parameters, and at the first layer.
+        inputs, activations = trace.saved
+        return kernels.network_gradient(
+            inputs, activations, self.parameters, grad_outputs, self.sizes
+        )
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""
@@ -112,8 +95,8 @@ class CompiledMLP:
         memory[:] = self.parameters
         self.parameters = memory
 
-    def layers(self, flat: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Views of a vector like `parameters`: each layer's weights, [in, out], and biases."""
+    def layers(self, flat: np.ndarray) -> Layers:
+        """Views of a vector like `parameters`."""
         views, start = [], 0
         for inputs, outputs in pairwise(self.sizes.tolist()):
             width = padded(outputs)
@@ -123,42 +106,28 @@ class CompiledMLP:
             start = end
         return views
 
-    def module(self) -> torch.nn.Sequential:
+    def module(self) -> "torch.nn.Sequential":
+        from mace_rl.numerics.torch_network import tanh_layers
+
         return tanh_layers(self.layers(self.parameters))
 
-    def load_module_state(self, state: dict[str, torch.Tensor]) -> None:
+    def load_module_state(self, state: "dict[str, torch.Tensor]") -> None:
         for place, (weights, biases) in enumerate(self.layers(self.parameters)):
             weights[:] = state[f"{2 * place}.weight"].numpy().T
             biases[:] = state[f"{2 * place}.bias"].numpy()
 
 
-def mlp(
-    sizes: list[int], output_gain: float, generator: np.random.Generator
-) -> torch.nn.Sequential:
-    """Linear layers with tanh between them: what `CompiledMLP` computes, in torch.
+def mlp(sizes: list[int], output_gain: float, generator: np.random.Generator) -> Layers:
+    """The layers of a new `CompiledMLP`, between which tanh stands.
 
-    Initial weights are orthogonal with gain √2, `output_gain` in the last layer; biases are 0.
+    Weights are orthogonal with gain √2, `output_gain` in the last layer; biases are 0.
     """
     pairs = list(pairwise(sizes))
     gains = [math.sqrt(2)] * (len(pairs) - 1) + [output_gain]
-    zeros = (np.zeros(outputs) for _, outputs in pairs)
-    weights = (gain * orthogonal(pair, generator) for pair, gain in zip(pairs, gains, strict=True))
-    return tanh_layers(zip(weights, zeros, strict=True))
-
-
-def tanh_layers(parameters: Iterable[tuple[np.ndarray, np.ndarray]]) -> torch.nn.Sequential:
-    """The torch module of `mlp` from each layer's weights, [in, out], and biases."""
-    layers: list[torch.nn.Module] = []
-    for weights, biases in parameters:
-        generator = torch.get_rng_state()  # a new layer draws weights, which are replaced
-        inputs, outputs = weights.shape
-        layer = torch.nn.Linear(inputs, outputs, device="cpu", dtype=torch.float32)
-        torch.set_rng_state(generator)
-        with torch.no_grad():
-            layer.weight.copy_(torch.from_numpy(weights.T))
-            layer.bias.copy_(torch.from_numpy(biases))
-        layers += [layer, torch.nn.Tanh()]
-    return torch.nn.Sequential(*layers[:-1])
+    return [
+        (gain * orthogonal(pair, generator), np.zeros(pair[1]))
+        for pair, gain in zip(pairs, gains, strict=True)
+    ]
 
 
 def orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:

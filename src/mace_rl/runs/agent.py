@@ -24,13 +24,13 @@ from mace_rl.base.rng import Streams
 from mace_rl.config.run import AgentConfig
 from mace_rl.environments.environment import LOST
 from mace_rl.numerics.normaliser import Normalisation
+from mace_rl.runs.agent_state import ENVIRONMENT
 from mace_rl.runs.checkpoint import CheckpointError
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.observations import encoded
 from mace_rl.training.factories import actor_critic, environment
 
 logger = logging.getLogger(__name__)
-ENVIRONMENT = "environment"  # the key in agent.pt of what the environment has learned
 
 
 class PolicyModule(TorchPolicy):

@@ -9,18 +9,18 @@ import io
 import sys
 import zipfile
 from collections import OrderedDict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
+from mace_rl.base.state import SavedArray
 from mace_rl.config.section import short_repr
+from mace_rl.runs import torch_archive
 
-TENSORS = (torch.Tensor, torch.nn.Parameter)
-PLAIN = (*TENSORS, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
+PLAIN = (SavedArray, bool, int, float, str, type(None), list, tuple, dict, OrderedDict)
 
 
 class CheckpointError(Refusal, ValueError):
@@ -29,8 +29,13 @@ class CheckpointError(Refusal, ValueError):
 
 def archive(content: dict[str, Any]) -> bytes:
     """Tensors, numbers, strings, lists and dicts as a torch archive; equal content, equal bytes."""
-    buffer = io.BytesIO()
-    torch.save(_unshared(content), buffer)
+    content, buffer = _unshared(content), io.BytesIO()
+    if "torch" not in sys.modules:  # so there are no tensors but `SavedArray`s
+        with suppress(KeyError, OverflowError):
+            return torch_archive.archive(content)
+    import torch
+
+    torch.save(content, buffer)
     return buffer.getvalue()
 
 
@@ -49,6 +54,8 @@ def _unshared(content: Any) -> Any:
 
 def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
     """Read what `archive` wrote; only plain data, not compressed, is accepted (`weights_only`)."""
+    import torch
+
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as members:
             if sum(member.file_size for member in members.infolist()) > len(data):
@@ -62,7 +69,9 @@ def unarchive(data: bytes, origin: Path) -> dict[str, Any]:
 
 def require_plain(value: Any, place: str) -> None:
     """`CheckpointError`, with the `place`, if `unarchive` would not read `value`."""
-    if type(value) not in PLAIN:
+    torch = sys.modules.get("torch")
+    tensors = (torch.Tensor, torch.nn.Parameter) if torch else ()
+    if type(value) not in (*PLAIN, *tensors):
         right = "a tensor, number, text, list or dict, to be read without executing anything"
         raise CheckpointError(f"{place} is {short_repr(value)}, but should be {right}")
     pairs = value.items() if isinstance(value, dict) else ()

@@ -1,32 +1,28 @@
 """A finished run on disk: the parts in its folder, each checked when it is first asked for."""
 
-import csv
 import hashlib
 import io
 import json
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from mace_rl.base import code_digest, files
-from mace_rl.base.tables import ALTERED, RecordError
+from mace_rl.base.tables import RecordError
 from mace_rl.config.plugins import code_outside, load
 from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError, check, short_repr
 from mace_rl.runs.provenance import difference, identity, read_record
-from mace_rl.training.records import (
-    EpisodeRecord,
-    RunKey,
-    as_columns,
-    check_episodes,
-    read_episodes,
-)
+from mace_rl.training.records import EpisodeRecord, RunKey, as_rows, read_episodes
 
 if TYPE_CHECKING:  # which take a second to import, as PyTorch does
     import pandas as pd
 
 Config = TypeVar("Config", bound=AgentConfig)
+ALTERED = "missing, cut off or altered (SHA-256 not as in run.json)"
 NEVER_WRITTEN = "not as a training writes it"
 WAY_OUT = "choose another folder, or set this run aside: --restart (in a program restart=True)"
 
@@ -86,40 +82,34 @@ class FinishedRun:
         """One of `files.RESULTS`; `RecordError` unless its digest is in `run.json`."""
         path = self.folder / name
         content = files.content(path) if path.exists() else None
-        if content is None or hashlib.sha256(content).hexdigest() != self._digest(name):
+        digest = self.record["outputs"].get(name)
+        if content is None or hashlib.sha256(content).hexdigest() != digest:
             raise RecordError(f"{path}: {ALTERED}")
         return content
 
-    def _digest(self, name: str) -> str:
-        return str(self.record["outputs"].get(name))
-
-    def frame(self, episodes: int) -> "pd.DataFrame":
-        """`episodes.csv`, as `read_episodes` reads it."""
-        path = self.folder / files.EPISODES
-        if not path.exists():
-            raise RecordError(f"{path}: {ALTERED}")
-        return read_episodes(path, episodes, self._digest(files.EPISODES))
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """`episodes.csv`, int64 or float64 [episodes]; `RecordError` names the damaged line."""
+        path, episodes = self.folder / files.EPISODES, self.record["config"]["episodes"]
+        try:
+            content = self.content(path.name)
+        except (RecordError, OSError):
+            if path.exists():
+                read_episodes(path, episodes)  # says in which line, if one looks damaged
+            raise
+        return read_episodes(path, episodes, content)
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """The same with the configured number of episodes."""
-        return self.frame(self.record["config"]["episodes"])
+        """The same as a frame."""
+        import pandas as pd
+
+        return pd.DataFrame(self.columns)
 
     @cached_property
     def rows(self) -> list[EpisodeRecord]:
-        """The same without pandas; `RecordError` names the file."""
-        types, content = get_type_hints(EpisodeRecord), self.content(files.EPISODES)
-        try:
-            lines = csv.DictReader(io.StringIO(content.decode(), newline=""))
-            rows = [EpisodeRecord(**{key: types[key](row[key]) for key in types}) for row in lines]
-            columns = as_columns(EpisodeRecord, rows)
-        except (KeyError, TypeError, ValueError, OverflowError, csv.Error):
-            rows = []
-        path = self.folder / files.EPISODES
-        if len(rows) != self.record["config"]["episodes"]:
-            raise RecordError(f"{path}: {NEVER_WRITTEN}")
-        check_episodes(path, columns)
-        return rows
+        """The same in rows."""
+        return as_rows(EpisodeRecord, self.columns)
 
     @cached_property
     def diagnostics(self) -> "pd.DataFrame | None":
@@ -166,7 +156,7 @@ def read_runs(
     runs: Iterable[tuple[str, str, int, int]],
     settings: Mapping[tuple[str, str], Mapping[str, Any]],
 ) -> dict[RunKey, "pd.DataFrame"]:
-    """The episodes of each run; raises what `FinishedRun.frame` raises.
+    """The episodes of each run; raises what `FinishedRun.episodes` raises.
 
     records: the paths of their `run.json`; runs: their environment, variant, seed and number of
     episodes; settings: `RunConfig.settings` by environment and variant. `RecordError` if a record
@@ -178,7 +168,7 @@ def read_runs(
         run = FinishedRun(Path(record).parent, trust=True)  # it is only compared
         wanted = plain[environment, variant] | {"seed": seed, "episodes": episodes}
         require_settings(run.record["config"], wanted, record)
-        found[environment, variant, seed] = run.frame(episodes)
+        found[environment, variant, seed] = run.episodes
     return found
 
 

@@ -19,7 +19,7 @@ from mace_rl.base.files import content
 from mace_rl.config.plugins import source_files
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import check, short_repr
-from mace_rl.environments import registered
+from mace_rl.environments import spec_of
 
 # The packages whose version can change a result.
 PACKAGES = (
@@ -63,11 +63,11 @@ class ProvenanceError(Refusal, ValueError):
 def identity(config: RunConfig) -> dict[str, Any]:
     """Equal identities give equal results, and continue each other's checkpoints."""
     named = config.references().items()
-    own = (file for key, name in named for file in source_files(name, key))
+    users_files = (file for key, name in named for file in source_files(name, key))
     return {
         "config": config.settings(),
         "versions": versions(config),
-        "sources": code_digest.digest("training", *own),  # the user's own code included
+        "sources": code_digest.digest("training", *users_files),
     }
 
 
@@ -100,7 +100,7 @@ def versions(config: RunConfig) -> dict[str, str]:
 
 def packages_of_environment(config: RunConfig) -> list[str]:
     """The environment's package and those of its wrappers, as if called like their modules."""
-    entry = getattr(registered().get(config.environment.rpartition(":")[2]), "entry_point", None)
+    entry = getattr(spec_of(config.environment), "entry_point", None)
     places = [entry if isinstance(entry, str) else "", *(name for name, _ in config.wrappers)]
     modules = (re.split(r"[.:]", place)[0].replace("_", "-") for place in places)
     return [name for name in modules if name not in ("", "mace-rl")]

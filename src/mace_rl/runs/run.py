@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,7 +15,6 @@ from statistics import fmean
 from typing import Any, Literal
 
 import scipy.linalg.cython_blas  # noqa: F401  (numba loads it: before threads are limited)
-import torch
 from threadpoolctl import threadpool_limits
 
 from mace_rl.base import files
@@ -22,9 +22,9 @@ from mace_rl.base.errors import Refusal
 from mace_rl.base.files import write_atomically
 from mace_rl.base.rng import Streams
 from mace_rl.config.run import IDENTITY, RunConfig
-from mace_rl.published import PublishedTrainer
+from mace_rl.environments import spec_of
 from mace_rl.runs import checkpoint, provenance
-from mace_rl.runs.agent import ENVIRONMENT, Agent
+from mace_rl.runs.agent_state import ENVIRONMENT, agent_state
 from mace_rl.runs.finished import WAY_OUT, continues, difference_from, finished
 from mace_rl.training import resuming
 from mace_rl.training.records import EpisodeRecord, as_columns, write_diagnostics, write_episodes
@@ -41,6 +41,8 @@ CHECKPOINT_SECONDS, CHECKPOINT_VARIABLE = 10.0, "MACE_RL_CHECKPOINT_SECONDS"
 CHECKPOINT_COST = 0.01
 FIRST_CHECKPOINT_SECONDS = 2.0  # after the start, or as soon as what that compiles has run
 LOCK_SECONDS = 5.0  # for which a run waits until one whose Snakemake was killed has ended
+# Packages whose environments and wrappers draw nothing from torch's generator.
+WITHOUT_TORCH = ("mace_rl.", "gymnasium.", "minigrid.", "pybullet_envs_gymnasium.")
 CLAIM = b"mace-rl trains here\n"  # in the lock file: the files of a run beside it are ours
 
 
@@ -70,12 +72,13 @@ def run(
     """
     directory = directory.absolute()  # an environment may change the current folder
     directory.mkdir(parents=True, exist_ok=True)
-    own = seeded(Streams(config.seed).sequence("global"))
+    if may_use_torch(config):
+        import torch  # noqa: F401  (now, so that what follows sets its generator and threads)
     with (
         exclusive(directory) as lock,
         threadpool_limits(1),
         single_threaded(),
-        own,
+        seeded(Streams(config.seed).sequence("global")),
         ExitStack() as end,
     ):
         if aside == "nothing" and finished(config, directory):
@@ -84,7 +87,7 @@ def run(
             return
         started = time.monotonic()
         identity, code = provenance.identity(config), provenance.git_state()
-        trainer = (PublishedTrainer if config.trainer == "published" else Trainer)(config)
+        trainer = trainer_of(config)
         end.callback(trainer.environment.env.close)
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
@@ -124,6 +127,23 @@ def run(
         if not keep_checkpoint:
             (directory / files.CHECKPOINT).unlink(missing_ok=True)
         file.unlink(missing_ok=True)
+
+
+def may_use_torch(config: RunConfig) -> bool:
+    """Whether something in this training may use torch, which other ones are quicker without."""
+    entry_point = getattr(spec_of(config.environment), "entry_point", None)
+    places = [entry_point, *config.references().values()]
+    ours = all(isinstance(place, str) and place.startswith(WITHOUT_TORCH) for place in places)
+    return not ours or config.engine == "torch" or config.trainer == "published"
+
+
+def trainer_of(config: RunConfig) -> Trainer:
+    """The one that the settings ask for."""
+    if config.trainer == "published":
+        from mace_rl.published import PublishedTrainer
+
+        return PublishedTrainer(config)
+    return Trainer(config)
 
 
 def to_continue(
@@ -242,16 +262,22 @@ def between_checkpoints() -> float:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """PyTorch on one thread with its default modes; afterwards as before, and nothing frozen."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """PyTorch, if used, on one thread with its default modes; afterwards as before.
+
+    Nothing stays frozen, and code that would end the program ends this run.
+    """
     try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+        with ExitStack() as end:
+            if torch := sys.modules.get("torch"):
+                end.callback(torch.set_num_threads, torch.get_num_threads())
+                torch.set_num_threads(1)
+                end.enter_context(torch.inference_mode(False))
+                end.enter_context(torch.enable_grad())
+                end.enter_context(torch.autocast("cpu", enabled=False))
             yield
     except SystemExit as error:
         raise RunError(f"code from outside mace_rl ended the program: {error!r}") from error
     finally:
-        torch.set_num_threads(threads)
         gc.unfreeze()
 
 
@@ -306,13 +332,13 @@ def write_results(
     (directory / files.RECORD).unlink(missing_ok=True)  # of the run that this one goes on from
     write_episodes(directory / files.EPISODES, as_columns(EpisodeRecord, trainer.records))
     write_diagnostics(directory / files.DIAGNOSTICS, trainer.diagnostics)
-    state = Agent(trainer.ppo, trainer.environment.given_space).state_dict()
+    state = agent_state(trainer.ppo, trainer.environment.given_space)
     if memory := trainer.environment.memory():
         state[ENVIRONMENT] = memory
     agent = checkpoint.archive(state)
     write_atomically(directory / files.AGENT, agent)
     record = identity | {
-        "threads": torch.get_num_threads(),
+        "threads": 1,
         **clock.account(),
         "start_seconds": clock.start_seconds,
         "peak_memory_mb": provenance.peak_memory_mb(),

@@ -30,7 +30,7 @@ def diagnose(
         for kind in ("extrinsic", "intrinsic")
     )
     parts = rollout.advantages
-    extrinsic, weighted = (dot(one, one) for one in (parts.extrinsic, parts.weighted))
+    extrinsic, weighted = (dot(part, part) for part in (parts.extrinsic, parts.weighted))
     number, episode, env_steps = count
     return UpdateRecord(
         update=number,

@@ -1,17 +1,11 @@
 """The parts of a run, made from its settings: what sets β, the bonus, the environment, PPO."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-import torch
 
 from mace_rl.agent.compiled_learner import CompiledLearner
-from mace_rl.agent.custom import custom_module
 from mace_rl.agent.learner import Learner
 from mace_rl.agent.policy import Policy
 from mace_rl.agent.ppo import PPO, ActorCritic
-from mace_rl.agent.torch_learner import TorchLearner
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaController
 from mace_rl.beta.credit import Credit, Evidence
@@ -20,7 +14,7 @@ from mace_rl.beta.objectives import Objective, Progress, Return, Score, Words
 from mace_rl.beta.schedule import Constant, ExponentialSchedule
 from mace_rl.bonus.curiosity import Curiosity
 from mace_rl.bonus.intrinsic import IntrinsicReward
-from mace_rl.config.agent import TorchModule
+from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.beta import (
     BetaRule,
     ConstantBeta,
@@ -43,7 +37,7 @@ from mace_rl.config.run import AgentConfig, RunConfig
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
-from mace_rl.numerics.network import CompiledMLP, TorchNetwork, mlp
+from mace_rl.numerics.network import CompiledMLP, Network, mlp
 from mace_rl.numerics.normaliser import RunningNormaliser
 from mace_rl.training.checks import CheckedBeta, CheckedBonus
 
@@ -129,15 +123,20 @@ def intrinsic_reward(
             space, size = environment.given_space, environment.observation_size
             return CheckedBonus(Curiosity(config.memory, config.novelty, space, size, streams))
         case CustomBonus(estimator=estimator, arguments=arguments):
-            key, own = "bonus.estimator", (environment, streams["bonus"])
-            made = make(estimator, key, IntrinsicReward, False, *own, **arguments)
+            key, stream = "bonus.estimator", streams["bonus"]
+            made = make(estimator, key, IntrinsicReward, False, environment, stream, **arguments)
             return CheckedBonus(made)
 
 
 def environment(config: AgentConfig, streams: Streams) -> Environment:
     """The environment that the agent acts in."""
-    own = config.max_episode_steps, config.environment_arguments, config.wrappers
-    made = Environment(config.environment, streams.sequence("environment"), *own)
+    made = Environment(
+        config.environment,
+        streams.sequence("environment"),
+        max_episode_steps=config.max_episode_steps,
+        arguments=config.environment_arguments,
+        wrappers=config.wrappers,
+    )
     made.clips_actions = config.ppo.clip_actions
     return made
 
@@ -147,24 +146,37 @@ def actor_critic(
 ) -> ActorCritic:
     """The untrained policy and critics, one for each kind of reward."""
     settings, size = config.ppo, spaces.observation_size
-    own = settings.network if isinstance(settings.network, TorchModule) else None
-
-    def module(outputs: int, output_gain: float, stream: str) -> torch.nn.Module:
-        generator = streams[stream]
-        if own is not None:
-            return custom_module(own, settings.hidden_units, size, outputs, generator)
-        return mlp([size, *settings.hidden_units, outputs], output_gain, generator)
-
-    network: Callable[[Any], Any] = CompiledMLP
     learner: type[Learner] = CompiledLearner
-    if own is not None or config.engine == "torch":
-        network, learner = TorchNetwork, TorchLearner
+    in_torch = config.engine == "torch" or isinstance(settings.network, TorchModule)
+    if in_torch:
+        from mace_rl.agent.torch_learner import TorchLearner as learner
+
+    def network(outputs: int, output_gain: float, stream: str) -> Network:
+        sizes, generator = [size, *settings.hidden_units, outputs], streams[stream]
+        if in_torch:
+            return torch_network(settings, sizes, output_gain, generator)
+        return CompiledMLP(mlp(sizes, output_gain, generator))
+
     # With a small last layer the policy starts near uniform, or with means near 0.
-    actor = network(module(spaces.action_size, 0.01, "actor"))
+    actor = network(spaces.action_size, 0.01, "actor")
     policy = Policy(actor, spaces.actions, settings.initial_log_std)
     kinds = ["extrinsic", "intrinsic"] if intrinsic else ["extrinsic"]
-    critics = {kind: network(module(1, 1.0, f"{kind}_critic")) for kind in kinds}
+    critics = {kind: network(1, 1.0, f"{kind}_critic") for kind in kinds}
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), learner)
+
+
+def torch_network(
+    settings: PPOConfig, sizes: list[int], output_gain: float, generator: np.random.Generator
+) -> Network:
+    """The user's own network, or the tanh network, in torch."""
+    from mace_rl.agent.custom import custom_module
+    from mace_rl.numerics.torch_network import TorchNetwork, tanh_layers
+
+    if not isinstance(settings.network, TorchModule):
+        return TorchNetwork(tanh_layers(mlp(sizes, output_gain, generator)))
+    inputs, outputs = sizes[0], sizes[-1]
+    units = settings.hidden_units
+    return TorchNetwork(custom_module(settings.network, units, inputs, outputs, generator))
 
 
 def ppo(config: AgentConfig, spaces: Spaces, intrinsic: bool, streams: Streams) -> PPO:

@@ -6,16 +6,13 @@ A damaged file is refused with its name and line, lest it become a plausible num
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, get_type_hints
+from typing import TypeVar, get_type_hints
 
 import numpy as np
 
 from mace_rl.base.files import write_atomically
-from mace_rl.base.tables import RecordError, read_table
+from mace_rl.base.tables import RecordError, read_columns
 from mace_rl.config.beta import LARGEST_BETA
-
-if TYPE_CHECKING:  # training only writes, without pandas
-    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -97,21 +94,23 @@ def _write(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     write_atomically(path, "\n".join([",".join(columns), *lines]) + "\n")
 
 
-def read_episodes(path: str | Path, episodes: int, digest: str | None = None) -> "pd.DataFrame":
-    """The records of a finished run: a frame with the columns of `EpisodeRecord`, int64 or float64.
+def read_episodes(
+    path: str | Path, episodes: int, content: bytes | None = None
+) -> dict[str, np.ndarray]:
+    """What `write_episodes` wrote; `RecordError` for a file that it did not write in full.
 
-    episodes: how many there have to be; digest: the file's SHA-256 in `run.json`. Raises
-    `RecordError` for a file that `write_episodes` did not write in full, or with another digest.
+    episodes: how many there have to be; content: of the file, if its digest is that in `run.json`.
     """
-    columns = get_type_hints(EpisodeRecord)
-    frame = read_table(path, columns, digest)
-    check_episodes(path, {name: frame[name].to_numpy() for name in columns})
-    if len(frame) != episodes:
+    types = get_type_hints(EpisodeRecord)
+    found = read_columns(path, types, content)
+    columns = {name: np.array(found[name], kind) for name, kind in types.items()}
+    check_episodes(path, columns)
+    if (count := len(columns["episode"])) != episodes:
         raise RecordError(
-            f"{path}: line {len(frame) + 1} is the last, after {len(frame)} episodes;"
+            f"{path}: line {count + 1} is the last, after {count} episodes;"
             f" the run is configured to have {episodes}"
         )
-    return frame
+    return columns
 
 
 def check_episodes(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:

@@ -3,13 +3,14 @@
 import hashlib
 import itertools
 import random
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch
 
+from mace_rl.base.state import saved
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.remembered import remembered, restore
@@ -42,19 +43,23 @@ def set_state(environment: Environment, state: dict[str, Any]) -> None:
 
 
 def global_state() -> dict[str, Any]:
-    """That of Python's, NumPy's and PyTorch's global generators."""
-    return {
+    """That of Python's, NumPy's and, if the process has imported it, PyTorch's generators."""
+    state = {
         "random": random.getstate(),
         "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002
-        "torch": torch.get_rng_state(),
     }
+    torch = sys.modules.get("torch")
+    return state | {"torch": torch.get_rng_state()} if torch else state
 
 
 def set_global_state(state: dict[str, Any]) -> None:
     """Restore what `global_state` returned."""
     random.setstate(state["random"])
     np.random.set_state(state["numpy"])  # noqa: NPY002
-    torch.set_rng_state(state["torch"])
+    if "torch" in state:
+        import torch
+
+        torch.set_rng_state(state["torch"])
 
 
 @contextmanager
@@ -64,7 +69,8 @@ def seeded(seed: np.random.SeedSequence) -> Iterator[None]:
     first, *others = seed.generate_state(6).tolist()
     random.seed(first)
     np.random.seed(others[:4])  # noqa: NPY002
-    torch.manual_seed(others[4])
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(others[4])
     try:
         yield
     finally:
@@ -97,7 +103,7 @@ class LastEpisodes:
         if not self.kept:
             return
         block = self.blocks[-1]
-        if len(block) >= EPISODES or sum(len(one["actions"]) for one in block) >= STEPS:
+        if len(block) >= EPISODES or sum(len(played["actions"]) for played in block) >= STEPS:
             self.blocks = [block, []]
         self.blocks[-1].append({"start": state_of(environment, of_process=not self.blocks[-1])})
 
@@ -108,22 +114,21 @@ class LastEpisodes:
 
     def saved(self) -> list[list[dict[str, Any]]]:
         """For a checkpoint."""
-        for one in itertools.chain.from_iterable(self.blocks):
-            if isinstance(episode := one["outcome"], Episode):
-                actions = torch.from_numpy(episode.actions)
-                one |= {"actions": actions, "outcome": _digest(episode)}
+        for played in itertools.chain.from_iterable(self.blocks):
+            if isinstance(episode := played["outcome"], Episode):
+                played |= {"actions": saved(episode.actions), "outcome": _digest(episode)}
         return self.blocks
 
 
 def replay_differs(environment: Environment, blocks: list[list[dict[str, Any]]]) -> str:
     """What is different if a new environment plays `LastEpisodes.blocks` again; "" if nothing."""
-    for one in itertools.chain.from_iterable(blocks):
-        set_state(environment, one["start"])
+    for played in itertools.chain.from_iterable(blocks):
+        set_state(environment, played["start"])
         try:
-            episode = roll_out(environment, _Again(), one["actions"].numpy())
+            episode = roll_out(environment, _Again(), played["actions"].numpy())
         except Exception as error:  # noqa: BLE001  (whatever it raises, in a state it never had)
             return " ".join(f"{type(error).__name__}: {error}".split())
-        if _digest(episode) != one["outcome"]:
+        if _digest(episode) != played["outcome"]:
             return "other observations or rewards"
     return ""
 

@@ -18,12 +18,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import torch
 
 from mace_rl.agent.advantages import discounted_returns, normalised, normalised_change
 from mace_rl.agent.learner import Batch, Update
 from mace_rl.agent.policy import ActingPolicy
 from mace_rl.base.rng import Streams
+from mace_rl.base.state import saved
 from mace_rl.beta.controller import BetaGradient
 from mace_rl.bonus.intrinsic import Bonus
 from mace_rl.config.run import RunConfig
@@ -148,16 +148,21 @@ class Trainer:
         if centred:
             extrinsic = extrinsic - mean(extrinsic)
         change = normalised_change(whole, intrinsic, centred)
-        steps = rollout.observations, rollout.actions
-        gradient, of_change = learner.policy_gradients(*steps, [extrinsic, change])
+        gradient, of_change = learner.policy_gradients(
+            rollout.observations, rollout.actions, [extrinsic, change]
+        )
         of_beta = BetaGradient(learner.preconditioned(of_change), root_mean_square(intrinsic))
         return self.controller.learn(gradient, root_mean_square(extrinsic), of_beta)
 
     def ppo_update(self, rollout: Rollout) -> Update:
         """PPO on the total reward, R_E + β R_I, whose advantage is A_E + β A_I."""
         advantages = normalised(rollout.advantages.total, self.config.ppo.centre_advantages)
-        steps = rollout.observations, rollout.actions, rollout.log_probs
-        batch = Batch(*steps, advantages.astype(np.float32))
+        batch = Batch(
+            observations=rollout.observations,
+            actions=rollout.actions,
+            log_probs=rollout.log_probs,
+            advantages=advantages.astype(np.float32),
+        )
         update = self.ppo.update(batch, {kind: rollout.returns(kind) for kind in self.ppo.critics})
         require_learned(update, self.ppo.learner)
         for item in rollout:
@@ -175,8 +180,8 @@ class Trainer:
             "noise": self.noise.bit_generator.state,
             "environment": resuming.state_of(self.environment),
             "last_episodes": self.last_episodes.saved(),
-            "records": as_tensors(as_columns(EpisodeRecord, self.records)),
-            "diagnostics": as_tensors(as_columns(UpdateRecord, self.diagnostics)),
+            "records": saved(as_columns(EpisodeRecord, self.records)),
+            "diagnostics": saved(as_columns(UpdateRecord, self.diagnostics)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -190,8 +195,3 @@ class Trainer:
         self.last_episodes.blocks = state["last_episodes"]
         self.records = as_rows(EpisodeRecord, state["records"])
         self.diagnostics = as_rows(UpdateRecord, state["diagnostics"])
-
-
-def as_tensors(columns: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    """For a checkpoint."""
-    return {name: torch.from_numpy(column) for name, column in columns.items()}

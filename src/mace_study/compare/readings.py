@@ -51,7 +51,7 @@ def readings(
 ) -> pd.DataFrame:
     """The data of readings.csv: one row per environment, reading, source and variant.
 
-    frames: the records (`read_episodes`) of each run (environment, variant, seed). Columns: env,
+    frames: `FinishedRun.episodes` of each run (environment, variant, seed). Columns: env,
     kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean, if training ended with the shortest budget of the environment's variants) and p_value: of

@@ -80,7 +80,7 @@ def quantity(figure: str, settings: MetricsConfig) -> Quantity:
 def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.DataFrame:
     """The curve of every run: the moving average of the `shown` column.
 
-    `frames` are the records (`read_episodes`) of each run (environment, variant, seed). The average
+    `frames` are `FinishedRun.episodes` of each run (environment, variant, seed). The average
     is over the last `window` episodes, or over all there are so far. Of E > 300 episodes only every
     ⌈E / 300⌉-th is kept, counted back from the last: more could not be seen. Curves of a variant
     end with its shortest run.
