@@ -89,7 +89,7 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
     columns = ["env", "variant", "seed", "episode", shown.name]
     every = shown.zero_is_shown
     variants = {run[1] for run, own in frames.items() if every or own[shown.column].any()}
-    curves = []
+    keys, episodes, averages = [], [], []
     shortest: dict[tuple[str, str], int] = {}
     for (environment, variant, _), frame in frames.items():
         known = shortest.get((environment, variant), len(frame))
@@ -102,9 +102,13 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
         stride = math.ceil(len(values) / MAX_POINTS)
         kept = np.arange(len(values) - 1, -1, -stride)[::-1]
         if variant in variants:
-            row = (environment, variant, seed, kept + 1, average[kept])
-            curves.append(pd.DataFrame(dict(zip(columns, row, strict=True))))
-    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
+            keys += [(environment, variant, seed)] * len(kept)
+            episodes.append(kept + 1)
+            averages.append(average[kept])
+    if not keys:
+        return pd.DataFrame(columns=columns)
+    curves = pd.DataFrame(keys, columns=columns[:3])
+    return curves.assign(episode=np.concatenate(episodes), **{shown.name: np.concatenate(averages)})
 
 
 def mean_curves(
