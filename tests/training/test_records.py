@@ -71,19 +71,12 @@ def test_what_run_json_does_not_describe_is_refused(tmp_path):
     """Plausible, but altered; and where the damage has a line, that is named."""
     path = tmp_path / "e.csv"
     path.write_text(text())
-    frame = read_episodes(path, 3)
-    assert frame["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
-    write_episodes(tmp_path / "again.csv", {name: frame[name].to_numpy() for name in frame})
-    assert (tmp_path / "again.csv").read_text() == text()
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert read_episodes(path, 3, digest).equals(read_episodes(path, 3))
-    path.write_text(text().replace("9.5", "9.75"))
-    assert len(read_episodes(path, 3)) == 3
-    with pytest.raises(RecordError, match=r"e\.csv: missing, cut off or altered"):
-        read_episodes(path, 3, digest)
-    path.write_text(text().replace("9.5", "x"))
-    with pytest.raises(RecordError, match="line 2: extrinsic_return is 'x'"):
-        read_episodes(path, 3, digest)
+    assert read_episodes(path, 3, digest)["extrinsic_return"].tolist() == [9.5, -19.0, 0.1]
+    for altered, said in (("9.75", "missing, cut off or altered"), ("x", "line 2: .*'x'")):
+        path.write_text(text().replace("9.5", altered))
+        with pytest.raises(RecordError, match=rf"e\.csv: {said}"):
+            read_episodes(path, 3, digest)
 
 
 def test_every_cut_is_refused(tmp_path):

@@ -29,6 +29,7 @@ SETTINGS = {
     "torch": {"engine": "torch", "ppo": SEVERAL},
     "a network of one's own": {"ppo": {"network": LAYER_NORM}},
 }
+OBJECTIVES = ("score", "progress", "return", "centred", "words", "credit_network")  # of β
 
 
 def rollouts_of(trainer: Trainer, monkeypatch) -> list[list]:
@@ -301,6 +302,7 @@ def test_global_generators_are_left_alone(run_config, settings):
         ("HopperBulletEnv-v0", "mace_full", "an episode"),
         ("FrozenLake-v1", "mace_full", "torch"),
         ("CartPole-v1", "mace_evidence", "several"),
+        *(("CartPole-v1", f"mace_{objective}", "several") for objective in OBJECTIVES),
         ("CartPole-v1", "pretrained", "several"),
         ("Pendulum-v1", "mace_full", "a network of one's own"),
     ],
