@@ -10,12 +10,7 @@ from shared import environment_of, random_episode
 from mace_rl.base.rng import Streams
 from mace_rl.beta.network import CompiledMetaNetwork
 from mace_rl.beta.objectives import Played, Progress, Return, Score, Words
-from mace_rl.config.beta import (
-    ProgressObjective,
-    ReturnObjective,
-    ScoreObjective,
-    WordsObjective,
-)
+from mace_rl.config.beta import ProgressObjective, ReturnObjective, ScoreObjective, WordsObjective
 from mace_rl.training.factories import beta_controller
 
 BY_RETURNS = [

@@ -9,15 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import (
-    CLAIMS,
-    ENVIRONMENTS,
-    PAPERS,
-    QUICK,
-    ROBUST,
-    VARIANTS,
-    table_for_claims,
-)
+from invented import CLAIMS, ENVIRONMENTS, PAPERS, QUICK, ROBUST, VARIANTS, table_for_claims
 from matplotlib.figure import Figure
 from shared import illegible, message
 

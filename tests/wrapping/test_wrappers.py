@@ -8,14 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import (
-    Box,
-    Dict,
-    Text,
-    Tuple,
-    flatdim,
-    flatten,
-)
+from gymnasium.spaces import Box, Dict, Text, Tuple, flatdim, flatten
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TransformObservation
