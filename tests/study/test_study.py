@@ -45,6 +45,7 @@ MISTAKES = """
 enviroments: [CartPole-v1]  # 'enviroments', 'environments'
 7: 8  # unknown, '7'
 training: {ppo: {clpi: 0.2}}  # training, 'ppo.clpi', 0.2, 'clip'
+environment_settings: {Acrobot-v1: {episode: 1}}  # settings.Acrobot-v1, 'episode', 'episodes'
 variant_settings: {mace_full: {memory: {capcity: 7}}}  # mace_full, 'memory.capcity', 7, 'capacity'
 metrics: {comparisons: [[mace_ful, ppo]]}  # metrics.comparisons, 'mace_ful', 'mace_full'
 variant_settings: {mace_full: {beta: {kind: mata}}}  # settings.mace_full, beta, mata, 'meta'
