@@ -5,7 +5,7 @@ import itertools
 import json
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -28,6 +28,7 @@ from mace_rl.agent.torch_policy import Categoricals
 from mace_rl.base.files import LOCK
 from mace_rl.config.run import RunConfig
 from mace_rl.environments.environment import Environment
+from mace_rl.environments.episode import Episode
 from mace_rl.numerics.network import CompiledMLP, Network
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.numerics.torch_network import TorchNetwork, tanh_layers
@@ -149,6 +150,16 @@ def environment_of(name: str, seed: int = 0, *settings: Any) -> Environment:
     return Environment(name, np.random.SeedSequence(seed), *settings)
 
 
+def random_episode(
+    rng: np.random.Generator, steps: int, seen: int = 4, actions: int = 2
+) -> tuple[Episode, np.ndarray]:
+    """An episode that nobody has played, and a bonus for each of its steps."""
+    observations = rng.standard_normal((steps + 1, seen)).astype(np.float32)
+    chosen = rng.integers(actions, size=steps)
+    rewards = 1 + rng.standard_normal(steps)
+    return Episode(observations, chosen, np.zeros(steps), rewards, True), rng.random(steps)
+
+
 def finish(run: RunConfig | Trainer) -> Trainer:
     trainer = run if isinstance(run, Trainer) else Trainer(run)
     for _ in trainer.run():
@@ -156,16 +167,15 @@ def finish(run: RunConfig | Trainer) -> Trainer:
     return trainer
 
 
-def likeliest(policy: torch.nn.Module, episodes: int, seed: int) -> list[float]:
-    """CartPole's returns under the most probable actions, as the library alone gives them."""
-    env, returns = gymnasium.make("CartPole-v1"), []
+def returns_of(name: str, act: Callable, episodes: int, seed: int) -> list[float]:
+    """The returns of the actions that `act` gives for observations, by the library alone."""
+    env, returns = gymnasium.make(name), []
     env.reset(seed=seed)  # an environment's first reset is thrown away
     env.reset(seed=seed)
     for _ in range(episodes):
         (observation, _), total, ends = env.reset(), 0.0, [False]
         while not any(ends):
-            action = int(policy(observation).probs.argmax())
-            observation, reward, *ends, _ = env.step(action)
+            observation, reward, *ends, _ = env.step(act(observation))
             total += reward
         returns.append(total)
     return returns

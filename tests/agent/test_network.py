@@ -10,9 +10,7 @@ import pytest
 import torch
 from shared import LAYER_NORM, laid_out
 
-from extras.pretrained.rule import WEIGHTS
 from mace_rl.agent.custom import custom_module
-from mace_rl.beta.lstm import MetaNetwork, lstm_output, read_network
 from mace_rl.bonus.density import CompiledAutoencoder
 from mace_rl.bonus.torch_density import MaskedAutoencoder
 from mace_rl.config.section import ConfigError
@@ -111,35 +109,6 @@ def test_initial_weights_are_orthogonal_and_biases_zero(sizes, output_gain):
         expected = gain**2 * np.eye(len(small))
         np.testing.assert_allclose(small @ small.T, expected, atol=1e-6 * gain**2)
         assert (biases == 0).all()
-
-
-@pytest.mark.parametrize("length", [1, 40])
-@pytest.mark.parametrize("units", [4, 12, None])
-def test_meta_network_is_pytorch_s_lstm_with_a_readout(units, length):
-    """With drawn weights, or those that come with the package.
-
-    PyTorch has the gates as input, forget, candidate, output, and two biases.
-    """
-    rng = np.random.default_rng(0)
-    if units:
-        shapes = (7, 4 * units), (units, 4 * units), (4 * units,), (units,), (1,)
-        network = MetaNetwork(*(drawn(rng, shape) for shape in shapes))
-    else:
-        network = read_network(WEIGHTS)
-    inputs, size = len(network.weight_ih), len(network.readout)
-
-    def theirs(weights: np.ndarray) -> torch.Tensor:
-        parts = torch.from_numpy(weights).double().chunk(4, dim=-1)
-        return torch.cat([parts[gate] for gate in (0, 1, 3, 2)], dim=-1).movedim(-1, 0)
-
-    lstm = torch.nn.LSTM(inputs, size, dtype=torch.float64)
-    ours = network.weight_ih, network.weight_hh, network.bias, np.zeros(4 * size)
-    names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
-    lstm.load_state_dict({name: theirs(part) for name, part in zip(names, ours, strict=True)})
-    sequence = 2 * drawn(rng, (length, inputs))
-    _, (hidden, _) = lstm(torch.from_numpy(sequence).double())
-    expected = network.readout @ hidden[0].detach().numpy() + network.readout_bias
-    assert lstm_output(sequence, network) == pytest.approx(*expected, rel=1e-5, abs=1e-5)
 
 
 def test_a_permutation_is_uniform_if_the_draws_are():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import environment_of, learned
+from shared import environment_of, learned, random_episode
 
 from mace_rl.base.rng import Streams
 from mace_rl.beta.controller import BetaGradient
@@ -16,13 +16,6 @@ from mace_rl.beta.network import CompiledMetaNetwork
 from mace_rl.beta.torch_network import TorchMetaNetwork
 from mace_rl.environments.episode import Episode
 from mace_rl.training.factories import beta_controller
-
-
-def invented(rng, steps: int, seen: int = 4, actions: int = 2) -> tuple[Episode, np.ndarray]:
-    observations = rng.standard_normal((steps + 1, seen)).astype(np.float32)
-    chosen = rng.integers(actions, size=steps)
-    rewards = 1 + rng.standard_normal(steps)
-    return Episode(observations, chosen, np.zeros(steps), rewards, True), rng.random(steps)
 
 
 @pytest.fixture
@@ -85,7 +78,7 @@ def test_what_is_read_by_numpy(make):
     """Means of stretches, standardised by all rows so far, the observations over √4."""
     controller, rng, rows = make(chunks=8), np.random.default_rng(0), []
     for steps in (3, 8, 21, 200):
-        episode, bonus = invented(rng, steps)
+        episode, bonus = random_episode(rng, steps)
         parts = episode.observations[:-1], np.eye(2)[episode.actions], episode.rewards[:, None]
         each = np.concatenate([*parts, bonus[:, None]], axis=1)
         own = [part.mean(axis=0) for part in np.split(each, stretches_of(steps))]
@@ -166,7 +159,7 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
                 added = evidence.logit(network.output(source))
                 expected = 1 / (1 + 1.5 * math.exp(-np.clip(added, -5.5, 6.4)))
             assert controller.next_beta() == pytest.approx(expected, rel=1e-4)
-            controller.next_episode(*invented(rng, int(rng.integers(1, 60))))
+            controller.next_episode(*random_episode(rng, int(rng.integers(1, 60))))
             source = controller.sequence
             read.append(source)
         if len(sources) > 3:
@@ -183,26 +176,17 @@ def test_beta_is_of_the_last_episode_and_learns_from_what_it_did(make):
     assert controller.next_beta() > 0.9  # more of it was always good
 
 
-def test_what_reads_nothing_is_told_the_same_for_all(make):
-    controller, rng = make(objective={"horizon": 1}, reads=False), np.random.default_rng(0)
-    for _ in range(15):
-        controller.next_beta()
-        controller.next_episode(*invented(rng, 20))
-        effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
-        controller.learn(np.array([1, 0], np.float32), 1.0, effect)
-        assert controller.next_beta() == pytest.approx(0.4) and (controller.sequence == 0).all()
-
-
-def test_without_evidence_beta_moves_with_the_output(run_config):
-    beta = learned("credit", horizon=1)
-    config = run_config("CartPole-v1", "mace_credit_network", 0, beta=beta)
+@pytest.mark.parametrize("reads", [True, False])
+def test_without_evidence_beta_moves_with_the_output(run_config, reads):
+    """And what reads nothing is told the same for all."""
+    changes = {"beta": learned("credit", horizon=1), "meta": {"reads": reads}}
+    config = run_config("CartPole-v1", "mace_credit_network", 0, **changes)
     controller = beta_controller(config, environment_of("CartPole-v1"), Streams(0))
-    rng = np.random.default_rng(0)
+    rng, good = np.random.default_rng(0), np.array([1, 0], np.float32)
     for _ in range(15):
         controller.next_beta()
-        controller.next_episode(*invented(rng, 20))
-        effect = BetaGradient(np.array([1, 0], np.float32), 1.0)
-        controller.learn(np.array([1, 0], np.float32), 1.0, effect)
+        controller.next_episode(*random_episode(rng, 20))
+        controller.learn(good, 1.0, BetaGradient(good, 1.0))
     output = controller.network.output(controller.sequence)
     assert controller.next_beta() == pytest.approx(1 / (1 + 1.5 * math.exp(-output)))
-    assert controller.next_beta() > 0.405
+    assert controller.next_beta() > 0.405 and controller.sequence.any() == reads

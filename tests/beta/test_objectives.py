@@ -5,20 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import environment_of, finish
+from shared import environment_of, random_episode
 
 from mace_rl.base.rng import Streams
 from mace_rl.beta.network import CompiledMetaNetwork
 from mace_rl.beta.objectives import Played, Progress, Return, Score, Words
-from mace_rl.config.beta import (
-    ProgressObjective,
-    ReturnObjective,
-    ScoreObjective,
-    WordsObjective,
-)
-from mace_rl.environments.episode import Episode
+from mace_rl.config.beta import ProgressObjective, ReturnObjective, ScoreObjective, WordsObjective
 from mace_rl.training.factories import beta_controller
-from mace_rl.training.trainer import Trainer
 
 BY_RETURNS = [
     "mace_full",
@@ -28,7 +21,6 @@ BY_RETURNS = [
     "mace_centred",
     "mace_words",
 ]
-READINGS = [*BY_RETURNS, "mace_credit_network", "mace_evidence"]
 SEQUENCE = np.zeros((1, 3), np.float32)
 
 
@@ -137,14 +129,6 @@ def test_words_by_autograd():
     assert (np.array(found[20:30]) > 0).all() and (np.array(found[50:]) < 0).mean() > 0.6
 
 
-def invented(rng, steps: int) -> tuple[Episode, np.ndarray]:
-    observations = rng.standard_normal((steps + 1, 4)).astype(np.float32)
-    rewards = rng.standard_normal(steps)
-    return Episode(observations, rng.integers(2, size=steps), np.zeros(steps), rewards, True), (
-        rng.random(steps)
-    )
-
-
 @pytest.mark.parametrize("variant", BY_RETURNS)
 def test_the_network_learns_what_its_objective_says(run_config, variant):
     """By hand: β from the last episode alone, and one step down the slope after each."""
@@ -155,7 +139,7 @@ def test_the_network_learns_what_its_objective_says(run_config, variant):
     network = CompiledMetaNetwork(config.meta, twin.reader.inputs, Streams(0)["meta"])
     rng, before, read, betas = np.random.default_rng(5), None, None, []
     for _ in range(80):
-        episode, bonus = invented(rng, int(rng.integers(1, 60)))
+        episode, bonus = random_episode(rng, int(rng.integers(1, 60)))
         output = 0.0 if read is None else network.output(read)
         added = 0.0 if read is None else twin.objective.logit(output)
         betas.append(controller.next_beta())
@@ -172,32 +156,3 @@ def test_the_network_learns_what_its_objective_says(run_config, variant):
         read = twin.reader.read(episode, bonus)
     assert (network.optimiser.parameters == controller.network.optimiser.parameters).all()
     assert len(set(betas)) > 20
-
-
-@pytest.mark.parametrize("variant", READINGS)
-def test_a_training_goes_on_from_its_state(run_config, variant):
-    config = run_config("CartPole-v1", variant, 4, episodes=40)
-    whole, begun, resumed = (Trainer(config) for _ in range(3))
-    finish(whole)
-    for _ in range(25):
-        next(rounds := begun.run())
-        rounds.close()
-    resumed.load_state_dict(begun.state_dict())
-    finish(resumed)
-    assert resumed.records == whole.records
-    found, expected = (trainer.ppo.policy.parameters for trainer in (resumed, whole))
-    assert (found == expected).all()
-
-
-@pytest.mark.parametrize("variant", ["mace_full", "mace_words", "mace_credit_network"])
-def test_both_engines_set_the_same_beta(run_config, variant):
-    config = run_config("CartPole-v1", variant, 0, engine="torch")
-    theirs = beta_controller(config, environment_of("CartPole-v1"), Streams(0))
-    config = run_config("CartPole-v1", variant, 0)
-    ours, rng = beta_controller(config, environment_of("CartPole-v1"), Streams(0)), None
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        episode, bonus = invented(rng, 20)
-        assert ours.next_beta() == pytest.approx(theirs.next_beta(), rel=1e-3)
-        ours.next_episode(episode, bonus)
-        theirs.next_episode(episode, bonus)

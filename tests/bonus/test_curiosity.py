@@ -162,24 +162,3 @@ def test_memory_holds_one_step_in_write_every_across_episodes_and_each_last(make
     memory = curiosity.memory
     stored = np.hstack([memory.keys, memory.values])[: len(memory)]
     assert stored.tolist() == expected
-
-
-def test_the_outcome_of_a_chain_of_10_steps_is_remembered(make):
-    """Reward at its end only, one step in 10 is written: the first of each episode, and the last.
-
-    Asked of the start, memory reads three entries of it, at distance 0 with weight 1 / 0.1, and
-    three of the last state before the end, at d² = 2 per dimension of 16 with 1 / 2.1. The mean of
-    both is usual, half their difference the spread.
-    """
-    curiosity = make("FrozenLake-v1", memory={})
-    chain = episode_of(np.eye(16)[:11], rewards=[0] * 9 + [1])
-    for _ in range(3):
-        curiosity.remember(chain, 0.9 ** np.arange(9.0, -1, -1))
-    weights = np.array([1 / 0.1, 1 / 2.1])
-    worst, best = 0.9**9, 1
-    recalled = weights @ [worst, best] / weights.sum()
-    found = curiosity.bonus(episode_of(np.eye(16)[[5, 0, 9]]))
-    assert curiosity.normaliser.count == 0  # one-hot states as they are
-    assert found.similarity == pytest.approx([1, 1])
-    worse = ((worst + best) / 2 - recalled) / ((best - worst) / 2)
-    assert found.relevance == pytest.approx([1 - worse, 1], rel=1e-4) and worse > 0.9

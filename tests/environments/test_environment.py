@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Text, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
 from shared import Bonanza, environment_of, finish
 
 from mace_rl.config.section import ConfigError
@@ -28,23 +28,12 @@ def play(environment: Environment) -> Episode:
         ({}, 10**9, "has a time limit of 1000000000 .*set one of 1 to 1000000"),
         ({"observation_space": Text(3)}, 10, "the observation is of Text.*, by --wrapper"),
         ({"observation_space": Box(0, 9, (84, 84, 4), np.uint8)}, 10, "has 28224 numbers"),
-        ({"action_space": Dict(a=Discrete(2))}, 10, "MultiBinary and Box work"),
         ({"action_space": Tuple([Discrete(2)])}, 10, "MultiBinary and Box work"),
         ({"action_space": Box(-1, 1, (0,))}, 10, "has 0 numbers"),
         ({"action_space": Box(0, 9, (1,), np.int64)}, 10, "of integers"),
         ({"action_space": Discrete(10**9)}, 10, "has 1000000000 numbers"),
         ({"action_space": Box(-1, 1, (200,))}, 10**6, "time limit is 1000000, not up to 500000"),
-        (
-            {"observation_space": Tuple([Dict(a=Text(3))])},
-            10,
-            r"\[0\]\['a'\] is of Text",
-        ),
-        ({"observation_space": Tuple([Dict(a=Discrete(10**9))])}, 10, "has 1000000000 numbers"),
-        (
-            {"observation_space": Tuple([Dict(a=Dict({}))])},
-            10,
-            r"\[0\]\['a'\] is of Dict",
-        ),
+        ({"observation_space": Tuple([Dict(a=Dict({}))])}, 10, r"\[0\]\['a'\] is of Dict"),
         (None, 10, ""),
     ],
 )
@@ -77,7 +66,6 @@ class Odd(Bonanza):
         ("np_random", np.random.RandomState(0), "np_random is a RandomState, not a Generator"),
         ("step", lambda _: (np.zeros(2), 0, True, {}), "step 1: not .*expected 5, got 4"),
         ("step", lambda _: (None, 0, True, False, {}), "the observation None .* after step 1"),
-        ("step", lambda _: (np.zeros(2), [1, 2], True, False, {}), "as reward after step 1"),
         ("step", lambda _: (np.zeros(2), [1, [2]], True, False, {}), "as reward after step 1"),
         ("step", lambda _: ((np.zeros(2), {}), 0, True, False, {}), "the observation .* step 1"),
         ("reset", lambda **_: sys.exit(0), "'Odd-v0': SystemExit: 0"),
@@ -108,22 +96,35 @@ def test_a_wrapper_that_hides_the_time_limit_is_told(run_config):
 
 
 PARTS = Dict(a=Discrete(3), b=Tuple([Box(0, 1, (2,)), Box(0, 1, (1,))]), c=MultiDiscrete([2, 3]))
+GOOD = {"a": 1, "b": (np.zeros(2), np.zeros(1)), "c": np.array([1, 2])}
+PIXELS, WHOLE = Box(0, 255, (2, 2, 3), np.uint8), Dict(a=Box(0, 9, (2,), np.int8))
 
 
 @pytest.mark.parametrize(
-    "part",
+    ("space", "good", "encoded", "others"),
     [
-        *({"a": state} for state in (-1, 3, 1.5, None, [0, 1])),
-        *({"c": np.array(state)} for state in ([2, 0], [0, -1], [0])),
-        *({"b": boxes} for boxes in ((np.zeros(1), np.zeros(2)), (np.zeros(2),), 0)),
+        (
+            PARTS,
+            GOOD,
+            [0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 1],
+            [
+                {"a": 1},
+                *(GOOD | {"a": state} for state in (-1, 3, 1.5, None, [0, 1])),
+                *(GOOD | {"c": np.array(state)} for state in ([2, 0], [0, -1], [0])),
+                *(GOOD | {"b": boxes} for boxes in ((np.zeros(1), np.zeros(2)), (np.zeros(2),), 0)),
+            ],
+        ),
+        # A fraction would be new at each visit, and 257 be 1.
+        (PIXELS, np.full(PIXELS.shape, 7), [7] * 12, [np.full(PIXELS.shape, 0.5)]),
+        (MultiBinary(3), [1.0, 0, 1], [1, 0, 1], [[0.5, 0, 1]]),
+        (WHOLE, {"a": [1.0, 2]}, [1, 2], [{"a": [1, 2.5]}, {"a": np.array([1, 257])}]),
     ],
 )
-def test_a_part_that_is_not_of_its_space_is_refused(part):
-    good = {"a": 1, "b": (np.zeros(2), np.zeros(1)), "c": np.array([1, 2])}
-    spaces = Spaces("Parts-v0", PARTS, Discrete(2))
-    assert (spaces.encode(good) == [0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 1]).all()
-    for given in (good | part, {"a": 1}):
-        with pytest.raises(ConfigError, match=r"Parts-v0.* after step 4, but its .* is Dict"):
+def test_what_is_not_of_its_space_is_refused(space, good, encoded, others):
+    spaces, kind = Spaces("Parts-v0", space, Discrete(2)), type(space).__name__
+    assert (spaces.encode(good) == encoded).all()
+    for given in others:
+        with pytest.raises(ConfigError, match=rf"Parts-v0.* after step 4, but its .* is {kind}"):
             spaces.encode(given, 4)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
-from invented import ROOT
+from shared import ROOT, Bonanza, play
 
 from mace_rl import CuriosityReward, load_agent, settings
 from mace_rl.bonus.counts import HashedCountNovelty
@@ -38,18 +38,14 @@ PIXELS = Box(0, 255, (2, 2, 3), np.uint8)
     ],
 )
 def test_what_is_counted(space, counted, run_config, register):
-    class Any(gymnasium.Env):
-        observation_space, action_space = space, Discrete(2)
+    class Any(gymnasium.ObservationWrapper):
+        observation_space = space
 
-        def reset(self, **options):
-            super().reset(**options)
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            return self.observation_space.sample(), 1.0, False, False, {}
+        def observation(self, observation):
+            return space.sample()
 
     assert is_discrete(space) == counted
-    name = register("Any-v0", Any, 6)
+    name = register("Any-v0", lambda: Any(Bonanza()), 6)
     trainer = Trainer(run_config(name, "mace_fixed", 0, episodes=3))
     list(trainer.run())
     kind = type(trainer.curiosity.novelty).__name__
@@ -126,8 +122,6 @@ def test_wrappers_go_around_the_environment_in_order(run_config):
     ("wrapper", "words"),
     [
         ("test_minigrid:Halve", ["has no 'Halve'"]),
-        ("no_module:Halved", ["no Python module 'no_module'"]),
-        ("test_minigrid:Spaces", ["a subclass of gymnasium.core.Wrapper"]),
         # An environment and no wrapper: it would be played in place of the one that is named.
         ("gymnasium.envs.classic_control:AcrobotEnv", ["a subclass of gymnasium.core.Wrapper"]),
         ({"wrapper": "test_minigrid:Halved", "arguments": {"part": 1}}, ["unexpected", "part"]),
@@ -147,29 +141,15 @@ class Forgetful(gymnasium.Wrapper):
         self.wrapped = env
 
 
-class Failing(gymnasium.RewardWrapper):
-    """Its own mistake."""
-
-    def reward(self, reward):
-        return {}[reward]
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "error", "said"),
-    [
-        ("test_minigrid:Forgetful", ConfigError, "^environment 'CartPole-v1': AttributeError: "),
-        ("test_minigrid:Failing", KeyError, r"^1.0\nin step 1 of an episode of CartPole"),
-    ],
-)
-def test_a_wrapper_s_mistake_is_said_to_be_that(wrapper, error, said):
-    with pytest.raises(error, match=said):
-        list(Trainer(settings("CartPole-v1", "ppo", environment_wrappers=[wrapper])).run())
+def test_a_wrapper_s_mistake_is_said_to_be_that():
+    config = settings("CartPole-v1", "ppo", environment_wrappers=["test_minigrid:Forgetful"])
+    with pytest.raises(ConfigError, match=r"^environment 'CartPole-v1': AttributeError: "):
+        list(Trainer(config).run())
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("x = (", r"SyntaxError: '\(' was never closed"),
         ("None.x", r"AttributeError: .*no attribute 'x' \(.*{module}.py:1\)"),
         ("raise SystemExit(3)", r"SystemExit: 3 \(.*{module}.py:1\)"),
     ],
@@ -183,46 +163,15 @@ def test_a_module_that_cannot_be_imported_gets_one_line(text, said, tmp_path, mo
     assert "\n" not in str(refused.value)
 
 
-PARTS = Dict({"a": MultiDiscrete([3, 4]), "b": Box(0, 9, (2,), np.int8)})
-
-
-@pytest.mark.parametrize(
-    ("space", "fits", "others"),
-    [
-        (PIXELS, PIXELS.sample() * 1.0, [PIXELS.sample() / 256 + 0.1]),
-        (MultiBinary(3), [1, 0, 1], [[0.5, 0, 1]]),
-        (MultiDiscrete([3, 4]), [2, 3], [[2, 4], [2], [0.5, 1]]),
-        (
-            PARTS,
-            {"a": [0, 0], "b": [1.0, 2]},
-            [{"a": [0, 0]}, {"a": [0, 0], "b": [1, 2.5]}, {"a": [0, 0], "b": np.array([1, 257])}],
-        ),
-    ],
-)
-def test_whole_numbers_are_whole_in_every_part(space, fits, others):
-    """A fraction would be new at each visit, or be cut off in silence."""
-    spaces = Spaces("x", space, Discrete(2))
-    flat = gymnasium.spaces.flatten(space, space.sample())
-    assert spaces.encode(fits).shape == flat.shape
-    for other in others:
-        with pytest.raises(ConfigError, match=r"gave the observation .* but its "):
-            spaces.encode(other)
-
-
 def test_a_text_is_refused_with_the_way_out_and_left_out_of_the_wrapper_s_bonus():
     spaces = Dict({"a": PIXELS, "mission": Text(5)}), Discrete(2)
     with pytest.raises(ConfigError, match=r"observation\['mission'\] is of Text.*--wrapper"):
         Spaces("x", *spaces)
     assert Spaces("x", *spaces, in_part=True).observation_size == 12
     env = CuriosityReward(gymnasium.make(DOOR))
-    env.reset(seed=0)
-    curious = []
-    for _ in range(400):
-        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
-        curious.append(info["curiosity"])
-        if terminated or truncated:
-            env.reset()
-    assert isinstance(observation["mission"], str)
+    played = play(env, 400)
+    curious = [info["curiosity"] for *_, info in played]
+    assert isinstance(played[-1][0]["mission"], str)
     assert max(curious) == 1 and min(curious) < 0.2
     assert isinstance(env.tracker.curiosity.novelty, HashedCountNovelty)
     other = CuriosityReward(gymnasium.make(DOOR))
@@ -249,15 +198,6 @@ def test_minigrid_trains_resumes_repeats_and_is_drawn(
     monkeypatch.setattr("sys.argv", ["mace-rl", "watch", str(folder), "--trust", "--seconds", "1"])
     main()
     assert (folder / "watch.gif").read_bytes()[:4] == b"GIF8"
-
-
-def test_the_command_line_takes_wrappers(tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-    words = f"train --env {DOOR} --wrapper {IMAGE} --variant ppo --episodes 1 --max-episode-steps 9"
-    monkeypatch.setattr("sys.argv", ["mace-rl", *words.split(), "--out", str(folder)])
-    main()
-    (around,) = FinishedRun(folder, trust=True).config.environment_wrappers
-    assert around.wrapper == IMAGE
 
 
 @pytest.mark.slow

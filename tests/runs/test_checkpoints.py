@@ -35,7 +35,6 @@ def signed(content: bytes) -> bytes:
         (lambda content: content[:-1] + bytes([content[-1] ^ 1]), "cut off or altered"),
         (lambda _: b"", "cut off or altered"),
         (lambda _: signed(checkpoint.archive({"identity": Bomb()})), "not a readable archive"),
-        (lambda _: signed(checkpoint.archive({})), "it has no identity or no state"),
         (lambda _: signed(checkpoint.archive({"identity": 5, "state": {}})), "it has no identity"),
     ],
 )
@@ -58,7 +57,6 @@ def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch
     others = [
         ({"seed": 1}, None, "config.seed was 0 and is 1"),
         ({"ppo": {"clip": 0.3}}, None, "config.ppo.clip was 0.2 and is 0.3"),
-        ({"beta": {"kind": "none"}}, None, "config.beta.kind was 'meta' and is 'none'"),
         ({}, (provenance, "versions", lambda _: found | {"torch": "9.9"}), "versions.torch was "),
         (
             {},
@@ -83,9 +81,9 @@ def test_another_unfinished_run_is_not_lost(interrupted, run_config, monkeypatch
     with pytest.raises(Killed), monkeypatch.context() as patched:
         patched.setattr(Trainer, "ppo_update", Mock(side_effect=Killed))
         run.run(config, directory, aside="all")
-    assert content_of(directory) == {} and content_of(directory / "_aside6") == before
-    run.run(config, directory / "_aside6")
-    assert len(provenance_of(directory / "_aside6")["interruptions"]) == 1
+    assert content_of(directory) == {} and content_of(directory / "_aside5") == before
+    run.run(config, directory / "_aside5")
+    assert len(provenance_of(directory / "_aside5")["interruptions"]) == 1
 
 
 @pytest.mark.parametrize(
@@ -155,7 +153,7 @@ def seed_all(seed: int) -> None:
     [
         *((kind, True) for kind in ("np_random", "random", "numpy", "torch", "offered", "wrapper")),
         *((kind, False) for kind in ("own", "kept", "counter")),
-        *((name, True) for name in ("FrozenLake-v1", "Pendulum-v1", "AntBulletEnv-v0")),
+        *((name, True) for name in ("BarrenRegion-v0", "Pendulum-v1", "AntBulletEnv-v0")),
         ("HumanoidFlagrunHarderBulletEnv-v0", False),
     ],
 )

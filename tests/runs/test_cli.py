@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from types import ModuleType
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -25,37 +26,39 @@ from mace_study.config.study import load_study
 
 CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
 
-# What is changed in a good command, and what is said.
-MISTAKES = [
-    ({"--variant": "beta_0.4"}, "'beta_0.4'.*--config FILE"),  # of a further study
-    ({"--seed": "4294967296"}, "4294967296"),
-    ({"--episodes": "0"}, "--episodes.* 0.*at least 1"),
-    ({"--max-episode-steps": "0"}, "--max-episode-steps.* 0.*at least 1"),
-    ({"--config": "/nonexistent.yaml"}, "/nonexistent.yaml"),
-    ({"--config": "/"}, "/"),
-    ({"--out": f"{__file__}/run"}, "test_cli.py"),
+TRAIN = ["train", *sum(GOOD.items(), ())]
+MISTAKES = [  # a command, an option, its value, and what is said
+    (TRAIN, "--variant", "beta_0.4", "'beta_0.4'.*--config FILE"),  # of a further study
+    (TRAIN, "--seed", "4294967296", "4294967296"),
+    (TRAIN, "--max-episode-steps", "0", "--max-episode-steps.* 0.*at least 1"),
+    (TRAIN, "--config", "/nonexistent.yaml", "/nonexistent.yaml"),
+    (TRAIN, "--out", f"{__file__}/run", "test_cli.py"),
+    (["watch", "."], "--out", "a.mp4", "--out is 'a.mp4', but should end in .gif"),
+    (["watch", "."], "--seconds", "nan", "--seconds is nan, but should be greater than 0"),
+    (["watch", "."], "--width", "2001", "--width is 2001, but should be from 50 to 2000"),
+    (["evaluate", "."], "--episodes", "-3", "--episodes is -3, but should be at least 1"),
+    (["evaluate", "."], "--seed", "-1", "--seed is -1, but should be from 0 to 4294967295"),
+    (["verify", "."], "--sample", "0", "--sample is 0, but should be at least 1"),
 ]
 # Mistakes in the form of the command, which argparse answers with the usage and its reason.
 MALFORMED = [
     [],
     ["tarin"],
     ["train", "--env", "CartPole-v1", "--var", "ppo", "--episodes", "0"],
-    ["train", *sum(GOOD.items(), ()), "--out", "x", "--seed", "1.5"],
-    ["train", *sum(GOOD.items(), ()), "--out", "x", "--engine", "jax"],
-    ["verify"],
+    [*TRAIN, "--out", "x", "--seed", "1.5"],
+    [*TRAIN, "--out", "x", "--engine", "jax"],
+    [*TRAIN, "--out", ""],
     ["status"],
 ]
 
 
-def refused(monkeypatch, options: dict[str, str], pattern: str) -> None:
-    said = refusal(monkeypatch, "train", *sum(options.items(), ()))
-    assert re.search(f"^mace-rl: .*{pattern}", said)
-
-
-@pytest.mark.parametrize(("change", "pattern"), MISTAKES)
-def test_a_mistake_gets_one_line(monkeypatch, tmp_path, change, pattern):
-    refused(monkeypatch, GOOD | {"--out": str(tmp_path / "run")} | change, pattern)
-    assert not (tmp_path / "run").exists()
+@pytest.mark.parametrize(("command", "option", "value", "pattern"), MISTAKES)
+def test_a_mistaken_value_of_an_option_is_named(
+    monkeypatch, tmp_path, command, option, value, pattern
+):
+    monkeypatch.chdir(tmp_path)
+    assert re.search(f"^mace-rl: .*{pattern}", refusal(monkeypatch, *command, option, value))
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("words", MALFORMED, ids=" ".join)
@@ -119,22 +122,15 @@ def test_anything_in_place_of_a_value_is_accepted_or_refused_in_one_line(path, v
 def test_a_run_by_hand_then_as_another_then_again(monkeypatch, tmp_path, caplog):
     caplog.set_level("INFO")
     out = tmp_path / "a run with ümlaut"
-    options = GOOD | {"--out": str(out)}
-    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    command = [*TRAIN, "--out", str(out)]
+    assert call(monkeypatch, *command) == (0, "")
     assert files(out) == sorted([*RESULTS, "checkpoint.pt"])
     whole = {path.name: path.read_bytes() for path in out.iterdir()}
     caplog.clear()
-    steps = tmp_path / "steps.yaml"
-    steps.write_text("environment_settings: {CartPole-v1: {max_episode_steps: 9}}")
-    for option, value, difference in (
-        ("--seed", "1", "config.seed was 0 and is 1"),
-        ("--engine", "torch", "config.engine was 'compiled' and is 'torch'"),
-        ("--config", str(steps), "config.max_episode_steps was None and is 9"),
-    ):
-        way_out = "choose another folder, or set this run aside: --restart"
-        refused(monkeypatch, options | {option: value}, f"{out}.*{difference}.*{way_out}")
-    assert not caplog.text  # neither trained nor called finished
-    assert call(monkeypatch, "train", *sum(options.items(), ())) == (0, "")
+    said = refusal(monkeypatch, *command, "--engine", "torch")
+    assert f"{out}" in said and "config.engine was 'compiled' and is 'torch'" in said
+    assert "--restart" in said and not caplog.text  # neither trained nor called finished
+    assert call(monkeypatch, *command) == (0, "")
     assert "finished" in caplog.text
     assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
 
@@ -147,36 +143,23 @@ def test_an_exception_of_an_environment_says_when_it_was(register, run_config, t
     assert caught.value.__notes__ == notes
 
 
-UNFIT = {  # an option's value, and what would be right
-    ("watch", "--out", "a.mp4"): "'a.mp4', but should end in .gif",
-    ("watch", "--seconds", "nan"): "nan, but should be greater than 0",
-    ("watch", "--width", "2001"): "2001, but should be from 50 to 2000",
-    ("evaluate", "--episodes", "-3"): "-3, but should be at least 1",
-    ("evaluate", "--seed", "-1"): "-1, but should be from 0 to 4294967295",
-    ("watch", "--seed", "4294967296"): "4294967296, but should be from 0 to 4294967295",
-    ("verify", "--sample", "0"): "0, but should be at least 1",
-}
-
-
-@pytest.mark.parametrize("command", UNFIT, ids=" ".join)
-def test_a_mistaken_value_of_an_option_is_named_alone(monkeypatch, tmp_path, command):
-    name, option, value = command
-    expected = f"mace-rl: {option} is {UNFIT[command]}"
-    assert call(monkeypatch, name, str(tmp_path), option, value) == (1, expected)
-
-
-def test_an_empty_path_is_refused(monkeypatch, capsys):
-    assert call(monkeypatch, "train", "--out", "", *sum(GOOD.items(), ()))[0] == 2
-    assert "argument --out: it is empty" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("error, said", [(MemoryError, "out of memory"), (OSError, "OSError()")])
-def test_an_error_without_words_is_said(monkeypatch, error, said):
-    def failing(_) -> None:
-        raise error
-
-    monkeypatch.setattr(cli, "train", failing)
-    assert call(monkeypatch, "train", *sum(GOOD.items(), ())) == (1, f"mace-rl: {said}")
+@pytest.mark.parametrize("command", [["status", "."], [*TRAIN, "--out", "x"]])
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (MemoryError, 1, "mace-rl: out of memory"),
+        (OSError, 1, "mace-rl: OSError()"),  # an error without words
+        (SystemExit(0), 1, "ended the program: SystemExit(0)"),  # by a module of the user's
+        (KeyboardInterrupt, 130, ""),
+    ],
+)
+def test_whatever_ends_a_command_is_said(monkeypatch, caplog, command, raised, code, said):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(cli, command[0], Mock(side_effect=raised))
+    found = call(monkeypatch, *command)
+    assert found[0] == code and found[1].endswith(said)
+    resumes = "; the same command resumes it" if command[0] == "train" else ""
+    assert caplog.messages == [f"interrupted{resumes}"] * (code == 130)
 
 
 def test_an_interrupt_during_imports_is_quiet(monkeypatch):
@@ -188,16 +171,6 @@ def test_an_interrupt_during_imports_is_quiet(monkeypatch):
     with pytest.raises(SystemExit) as caught:
         __main__.main()
     assert caught.value.code == 130
-
-
-def test_an_interrupted_training_says_that_it_resumes(monkeypatch, caplog):
-    def interrupted(_) -> None:
-        raise KeyboardInterrupt
-
-    caplog.set_level("INFO")
-    monkeypatch.setattr(cli, "train", interrupted)
-    assert call(monkeypatch, "train", "--out", "x", *sum(GOOD.items(), ())) == (130, "")
-    assert caplog.messages == ["interrupted; the same command resumes it"]
 
 
 LOUD = """
@@ -213,7 +186,7 @@ gymnasium.register("Loud-v0", Loud, max_episode_steps=5)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "shown", [">&-", "2>&-", "<&- >&- 2>&-", "2>&1 | true", ">/dev/full 2>&1", "a lost terminal"]
+    "shown", [">&-", "<&- >&- 2>&-", "2>&1 | true", ">/dev/full 2>&1", "a lost terminal"]
 )
 def test_nobody_has_to_watch_a_training(tmp_path, shown):
     (tmp_path / "loud.py").write_text(LOUD, encoding="utf-8")
@@ -247,16 +220,8 @@ def test_an_output_that_is_lost_has_not_succeeded(trained, shown):
     assert done.stderr.startswith("mace-rl: standard output: ")
 
 
-@pytest.mark.parametrize("command", [["status", "."], ["train", *sum(GOOD.items(), ())]])
-def test_what_leaves_by_itself_has_not_succeeded(monkeypatch, command):
-    """A module of the user's that calls `sys.exit(0)` when it is imported."""
-    monkeypatch.setattr(cli, command[0], lambda _: sys.exit(0))
-    code, said = call(monkeypatch, *command)
-    assert code == 1 and said.endswith("ended the program: SystemExit(0)")
-
-
 def test_code_that_cannot_run_uncompiled_says_so(tmp_path):
-    command = [sys.executable, "-m", "mace_rl", "train", *sum(GOOD.items(), ()), "--out", "x"]
+    command = [sys.executable, "-m", "mace_rl", *TRAIN, "--out", "x"]
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)

@@ -21,39 +21,50 @@ CHANGES = [  # of a file, what is added, whether a training has other sources, a
 ]
 
 
-@pytest.mark.parametrize(("name", "added", "training", "everything", "kernels"), CHANGES)
-def test_what_an_edit_changes(tmp_path, name, added, training, everything, kernels):
+def digests(source: Path, *own: Path) -> list[str]:
+    """Of a copy of the packages: each part's, with files of a user's own, and the kernels'."""
+    spec = spec_from_file_location("of_a_copy", source / "mace_rl" / "base" / "code_digest.py")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return [*(module.digest(part, *own) for part in PARTS), module.kernels()]
 
-    def copy():
-        spec = spec_from_file_location(
-            "of_a_copy", tmp_path / "mace_rl" / "base" / "code_digest.py"
-        )
-        module = module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module
 
-    def digests(*own: Path) -> dict[str, str]:
-        return {part: copy().digest(part, *own) for part in PARTS}
-
-    unwanted = shutil.ignore_patterns("__pycache__")
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """A copy of the packages, which tests leave as they find it."""
+    copy, unwanted = tmp_path_factory.mktemp("source"), shutil.ignore_patterns("__pycache__")
     for package in code_digest.PACKAGES["everything"]:
-        source = code_digest.PACKAGE.parent / package
-        shutil.copytree(source, tmp_path / package, ignore=unwanted)
-    before, compiled = digests(), copy().kernels()
-    assert before == {part: code_digest.digest(part) for part in PARTS}
-    file = tmp_path / name
+        shutil.copytree(code_digest.PACKAGE.parent / package, copy / package, ignore=unwanted)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def before(source) -> list[str]:
+    found = digests(source)
+    assert found[:2] == [code_digest.digest(part) for part in PARTS]
+    return found
+
+
+@pytest.mark.parametrize(("name", "added", "training", "everything", "kernels"), CHANGES)
+def test_what_an_edit_changes(source, before, name, added, training, everything, kernels):
+    file = source / name
     content = file.read_bytes() if file.exists() else b""
     file.write_bytes(content + f"\n{added}\n".encode())
-    changed = {part for part, value in digests().items() if value != before[part]}
-    assert changed == {
-        part for part, does in zip(PARTS, (training, everything), strict=True) if does
-    }
-    assert (copy().kernels() != compiled) == kernels
+    changed = [one != other for one, other in zip(digests(source), before, strict=True)]
+    if content:
+        file.write_bytes(content)
+    else:
+        file.unlink()
+    assert changed == [training, everything, kernels]
+
+
+def test_code_of_the_users_own_counts(source, tmp_path):
     own = tmp_path / "own.py"
     own.write_text('"""Words."""\n')
-    with_own = digests(own)
+    first = digests(source, own)
     own.write_text("x = 1\n")
-    assert all(digests(own)[part] != value for part, value in with_own.items())
+    same = [one == other for one, other in zip(first, digests(source, own), strict=True)]
+    assert same == [False, False, True]
 
 
 def test_kernels_come_from_the_folders_that_their_cache_looks_at():

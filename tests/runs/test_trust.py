@@ -90,14 +90,7 @@ def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkey
 
 @pytest.mark.parametrize(
     "reference",
-    [
-        *("pydoc:pipepager", "subprocess:call", "os:system", "collections:OrderedDict"),
-        *(
-            "mace_rl.runs.provenance:subprocess",
-            "mace_rl.base.files:write_atomically",
-            "numpy:array",
-        ),
-    ],
+    ["pydoc:pipepager", "collections:OrderedDict", "mace_rl.runs.provenance:subprocess"],
 )
 @pytest.mark.parametrize(("kind", "functions"), [(BetaController, False), (torch.nn.Module, True)])
 def test_what_is_of_another_kind_is_not_called(reference, kind, functions):
@@ -126,14 +119,11 @@ DAMAGE = {
     "not a readable archive: Weights only load failed$": lambda _: archive({"a": np.zeros(1)}),
     f"{BIAS} is .*shape .3,.*should be .*shape .64,": lambda s: archive(s | {BIAS: torch.ones(3)}),
     f"{BIAS} has NaN or Inf": lambda s: archive(s | {BIAS: s[BIAS] * torch.nan}),
-    f"{BIAS} is .*float64": lambda s: archive(s | {BIAS: s[BIAS].double()}),
     f"{BIAS} is a str": lambda s: archive(s | {BIAS: "x"}),
     f"{BIAS} is a Tensor": lambda s: archive(s | {BIAS: torch.nested.nested_tensor([s[BIAS]])}),
     f"{BIAS} is missing": lambda s: archive({k: v for k, v in s.items() if k != BIAS}),
-    "other is .* should be missing": lambda s: archive(s | {"other": torch.ones(1)}),
     "other is a NoneType, but should be missing": lambda s: archive(s | {"other": None}),
     "not a readable archive: it is compressed": lambda _: compressed(),
-    "not a readable archive": lambda _: archive(torch.ones(3)),
     "not a readable archive: File": lambda _: b"no archive",
 }
 
@@ -164,14 +154,10 @@ RECORDS = [  # a text of run.json, another in its place, and what is said
     (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
     (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
     (r"\A.*\Z", "[]", "the configuration is |"),
-    (r"\A.*\Z", "{}", "the key 'config' is missing"),
     (r"\A.*\Z", '{"config": {"environment": 1}}', "config.environment is 1, but should be a valid"),
     (r'"outputs": \{.*?\}', '"outputs": 3', "outputs is 3, but"),
-    (r'"machine": \{.*?\}', '"machine": 3', "machine is 3, but"),
     ('"ppo"', '"a,b"', "config.variant is 'a,b', but"),
     (r'"seed": \d+', r'"seed": "\\n7\\n"', "config.seed is '.n7.n', but"),
-    (r'"seed": \d+', '"seed": -5', "config.seed is -5, but"),
-    (r'"episodes": \d+', '"episodes": "3"', "config.episodes is '3', but"),
     (r'"episodes": \d+', '"episodes": 0', "config.episodes is 0, but"),
     (r'"seconds": [0-9.]+', '"seconds": "3"', "seconds is '3', but"),
     ('"CartPole-v1"', '"CartPole-v1,0"', "config.environment is 'CartPole-v1,0', but"),

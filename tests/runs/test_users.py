@@ -3,14 +3,13 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box, MultiBinary, MultiDiscrete
 from shared import call, finish, provenance_of, refusal, refused
 
 from mace_rl import CuriosityReward
 from mace_rl.config.plugins import call_of
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import environment as environments
-from mace_rl.environments.spaces import Spaces
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.evaluate import evaluate
 
@@ -72,11 +71,6 @@ def test_who_plays_with_such_an_agent_gets_such_actions(trained, register, kind)
         env.step(env.action_space.sample())
 
 
-def test_actions_in_parts_of_different_kinds_stay_refused():
-    with refused(ConfigError, "Discrete, MultiDiscrete, MultiBinary and Box work"):
-        Spaces("a test's", Box(-1, 1, (2,)), Dict(a=Discrete(2)))
-
-
 def test_an_environment_that_ends_by_itself_needs_no_limit(run_config, register):
     assert len(finish(run_config("Blackjack-v1", "mace_fixed", 0, episodes=20)).records) == 20
     name = register("Copies-v0", Copies, None, kind="MultiBinary")
@@ -128,8 +122,3 @@ def test_arguments_on_the_command_line(monkeypatch, tmp_path):
     ]
     said = refusal(monkeypatch, *words, "--env", "CartPole-v1(x)")
     assert "--env is 'CartPole-v1(x)', but it should be a name" in said
-
-
-def test_a_large_image_is_told_how_to_get_smaller():
-    with refused(ConfigError, "100800 numbers .*ResizeObservation.shape=.64, 64.*Grayscale"):
-        Spaces("a test's", Box(0, 255, (210, 160, 3), np.uint8), Discrete(2))

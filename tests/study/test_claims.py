@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -36,7 +37,6 @@ SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
 PLAIN = {"ppo": 0.0, "mace_fixed": 0.1, "mace_full": 0.3}
 FIXED = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.1}
 WORST = {"ppo": 0.2, "mace_fixed": 0.2, "mace_full": -0.1}
-VAST = {"ppo": 0.0, "mace_fixed": 0.3, "mace_full": 0.6}
 SLIGHT = {"ppo": 0.0, "mace_fixed": 0.01, "mace_full": 0.03}
 BUT_C6 = [f"C{number}" for number in range(1, 11) if number != 6]  # which says that fixed is first
 OF_FULL = [name for name in BUT_C6 if name != "C9"]  # C9 asks nothing of the others
@@ -66,8 +66,7 @@ TOO_FEW = "cannot tell (too few seeds)"
         (20, WORST, 0.02, BUT_C6, "not reproduced"),
         (20, EQUAL, 0.02, [*BUT_C6, "C6"], "not reproduced"),  # nothing worth mentioning
         (12, SMALL, 0.3, BUT_C6, TOO_FEW),  # what seeds cannot tell apart
-        (9, EQUAL, 0.0, [*BUT_C6, "C6"], TOO_FEW),  # too few decide nothing
-        (9, PLAIN, 0.02, [*BUT_C6, "C6"], TOO_FEW),
+        (9, PLAIN, 0.02, [*BUT_C6, "C6"], TOO_FEW),  # too few decide nothing
         (1, PLAIN, 0.02, [*BUT_C6, "C6"], TOO_FEW),
     ],
 )
@@ -91,10 +90,18 @@ def test_every_combination_of_parts_has_the_verdict_of_the_protocol() -> None:
         assert verdicts.verdict(found) == expected
 
 
-def test_all_parts_are_corrected_together_and_have_their_margins() -> None:
-    answers = verdicts.ledger(table_for_claims(12, SMALL, noise=0.1), QUICK, PAPERS)
+@pytest.fixture(scope="module")
+def small() -> SimpleNamespace:
+    """A table of small differences, its runs in order, and each claim's judgements."""
+    frame = table_for_claims(12, SMALL, noise=0.1)
+    ways = {one.claim: one.ways for one in verdicts.ledger(frame, QUICK, PAPERS)}
+    runs = frame.set_index(["env", "variant", "seed"]).sort_index()
+    return SimpleNamespace(frame=frame, runs=runs, ways=ways)
+
+
+def test_all_parts_are_corrected_together_and_have_their_margins(small) -> None:
     for how in (LITERAL, ROBUST):
-        parts = [part for answer in answers for part in answer.ways[how].parts]
+        parts = [part for ways in small.ways.values() for part in ways[how].parts]
         # 2 parts of C1 to C5 each, 3 of C6, 4 of C7, 2 of C8, 3 of C9, 2 of C10.
         count = len(parts)
         assert count == 24
@@ -112,24 +119,6 @@ def test_all_parts_are_corrected_together_and_have_their_margins() -> None:
             assert margins["final_return", environment] == pytest.approx(span / 20)
         if how == ROBUST:
             assert [margins[key] for key in margins if len(key) == 4] == pytest.approx([0.05])
-
-
-def test_a_part_is_what_paired_statistics_say() -> None:
-    frame = table_for_claims(12, SMALL, noise=0.1)
-    part = found_of(frame, "C1")[0]
-    assert (part.variant, part.baseline) == ("mace_full", "ppo")
-    runs = frame[frame["env"] == "Acrobot-v1"].set_index(["variant", "seed"])
-    times = runs["sample_efficiency_common"]
-    gain = times["ppo"] - times["mace_full"]  # fewer episodes are the improvement
-    assert part.difference == pytest.approx(gain.mean())
-    assert part.in_paper == 186 - 249  # of its Table 1: the learned β is the later one
-    t = scipy.stats.t(11)
-    assert part.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * gain.sem())
-    u = scipy.stats.mannwhitneyu(times["ppo"], times["mace_full"]).statistic
-    assert part.probability == pytest.approx(u / 144)
-    # Verdicts are of 95 % intervals, whatever those of the tables have.
-    wide = STUDY.metrics.model_copy(update={"confidence": 0.5})
-    assert verdicts.ledger(frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
 
 
 def test_a_reading_is_of_the_metric_with_the_longest_name_that_it_begins_with() -> None:
@@ -237,14 +226,22 @@ def test_what_could_not_improve_could_not_be_asked() -> None:
     assert judged["C7"].ways[ROBUST].verdict == "cannot tell (too few seeds)"
 
 
-def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
-    frame = table_for_claims(12, SMALL, noise=0.1)
-    answers = {one.claim: one.ways for one in verdicts.ledger(frame, QUICK, PAPERS)}
-    runs = frame.set_index(["env", "variant", "seed"]).sort_index()
+def test_a_part_is_what_paired_statistics_say_with_margin_room_and_replication(small) -> None:
+    runs, answers = small.runs, small.ways
     efficiency = runs.loc["Acrobot-v1", "sample_efficiency_common"]
     (part, _), mean = answers["C1"][ROBUST].parts, efficiency["ppo"].mean()
+    assert (part.variant, part.baseline) == ("mace_full", "ppo")
     assert (part.worth_mentioning, part.room) == pytest.approx((mean / 10, mean - 50))
-    gain = efficiency["ppo"] - efficiency["mace_full"]
+    gain = efficiency["ppo"] - efficiency["mace_full"]  # fewer episodes are the improvement
+    assert part.difference == pytest.approx(gain.mean())
+    assert part.in_paper == 186 - 249  # of its Table 1: the learned β is the later one
+    t = scipy.stats.t(11)
+    assert part.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * gain.sem())
+    u = scipy.stats.mannwhitneyu(efficiency["ppo"], efficiency["mace_full"]).statistic
+    assert part.probability == pytest.approx(u / 144)
+    # Verdicts are of 95 % intervals, whatever those of the tables have.
+    wide = QUICK.model_copy(update={"confidence": 0.5})
+    assert verdicts.ledger(small.frame, wide, PAPERS)[0].ways[ROBUST].parts[0] == part
     chance = scipy.stats.t.interval(0.95, 11, -63, gain.std() * (13 / 12) ** 0.5)
     assert (part.predicted_low, part.predicted_high) == pytest.approx(chance)
     assert part.low > -63 and chance[0] < part.difference < chance[1]
@@ -267,11 +264,10 @@ def test_margin_room_and_replication_are_what_they_are_by_hand() -> None:
     ("how", "metric", "window"),
     [(LITERAL, "convergence_steps_public_code", 50), (ROBUST, "convergence_steps", 400)],
 )
-def test_a_rule_with_its_own_window_has_the_margin_of_that(how, metric, window) -> None:
-    frame = table_for_claims(12, SMALL, noise=0.1)
+def test_a_rule_with_its_own_window_has_the_margin_of_that(small, how, metric, window) -> None:
     wide = QUICK.model_copy(update={"moving_average": 400})
-    answers = {one.claim: one.ways for one in verdicts.ledger(frame, wide, PAPERS)}
-    mean = frame.query("env == 'Acrobot-v1' and variant == 'ppo'")[metric].mean()
+    answers = {one.claim: one.ways for one in verdicts.ledger(small.frame, wide, PAPERS)}
+    mean = small.runs.loc["Acrobot-v1", "ppo"][metric].mean()
     part = answers["C2"][how].parts[0]
     assert (part.metric, part.worth_mentioning) == (metric, max(mean / 10, window))
 
@@ -281,9 +277,7 @@ def test_a_rule_with_its_own_window_has_the_margin_of_that(how, metric, window) 
 SEVENTH = " " * 12 + "- {<<: *full, environments: [Acrobot-v1, HopperBulletEnv-v0], "
 SEVENTH += "metric: final_return}\n"
 MISTAKES = [  # one text for another, and what is said of it
-    ("variant: mace_full", "variant: mace_ful", ["C1.parts", "'mace_ful'", "'mace_full'"]),
     ("metric: final_return", "metric: final_retrun", ["C6.parts", "'final_retrun'", "'final_re"]),
-    ("[Acrobot-v1, HopperB", "[Acrobat-v1, HopperB", ["C7.parts", "'Acrobat-v1'", "'Acrobot-v1'"]),
     ("- &full {", "- &full {tugether: true, ", ["tugether", "C1.parts", "'together'"]),
     ("over: [ppo, mace_fixed]", "over: [mace_full]", ["C1.parts", "the variant itself"]),
     ("robust: *above", "rubust: *above", ["C7.parts", "'rubust'", "'robust'"]),
@@ -297,14 +291,7 @@ MISTAKES = [  # one text for another, and what is said of it
         ["table1.public_code", "in this order"],
     ),
     ("  discount:", "  discuont:", ["table2", "'discuont'", "'discount'"]),
-    ("metrics: [sample_eff", "metrics: [smaple_eff", ["table1.metrics", "'sample_efficiency'"]),
     ("shown: reproduced, ", "", ["the paper's claims.words.shown", "missing"]),
-    (
-        ", no_room: cannot tell (nothing to gain)",
-        "",
-        ["claims.words.no_room", "missing"],
-    ),
-    ("[Acrobot-v1, HopperB", "[Acrobot-v1, Acrobot-v1, HopperB", ["'Acrobot-v1' should be there"]),
     ("over: [ppo, mace_fixed]", "over: [ppo, ppo]", ["C1.parts", "'ppo' should be there once"]),
     (SEVENTH, f"{SEVENTH}{SEVENTH}", ["C7.parts.by the paper's words and code has a part twice"]),
 ]

@@ -1,7 +1,6 @@
 """Figures and pictures: their data against pandas, scipy and loops, and what files they give."""
 
 import math
-from dataclasses import replace
 from itertools import product
 
 import matplotlib
@@ -12,7 +11,6 @@ import scipy.stats
 from invented import (
     CLAIMS,
     QUESTIONED,
-    ROBUST,
     SEEDS,
     STUDY,
     table_for_claims,
@@ -27,7 +25,6 @@ from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import ConstantsConfig, FigureConfig, MetricsConfig
 from mace_study.show import curves as c
 from mace_study.show.pictures import PICTURES, Source
-from mace_study.show.worlds import draw_curves
 
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
 RETURN, BETA = c.quantity("1", METRICS), c.quantity("2", METRICS)
@@ -252,38 +249,6 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
             assert row["outcome"] == part.outcome and row["answer"] == judged.outcome
             assert row["size"] == part.size
         assert not rows.duplicated(["claim", "part"]).any()  # the words tell parts from each other
-
-
-def test_a_part_that_has_nothing_to_be_told_from_is_called_by_its_metric(ledgers, settings):
-    [answer] = [one for one in ledgers[0] if one.claim == "C9"]
-    judged = answer.ways[ROBUST]
-    alone = replace(judged, parts=judged.parts[:1])
-    answer = replace(answer, ways={ROBUST: alone})
-    table = PICTURES["forest"].data(Source({}, [answer], settings, CLAIMS))
-    assert list(table["part"]) == ["stagnation_correlation_before"]
-
-
-def test_parts_of_environments_with_like_names_are_told_apart(ledgers, settings):
-    [answer] = [one for one in ledgers[0] if one.claim == "C9"]
-    judged = answer.ways[ROBUST]
-    for names, shown in (
-        (("CartPole-v0", "CartPole-v1"), ("CartPole-v0", "CartPole-v1")),
-        (("a:Maze", "a:Sea-v0"), ("Maze", "Sea")),
-    ):
-        parts = [replace(judged.parts[0], environments=(name,)) for name in names]
-        ways = {ROBUST: replace(judged, parts=tuple(parts))}
-        source = Source({}, [replace(answer, ways=ways)], settings, CLAIMS)
-        assert tuple(PICTURES["forest"].data(source)["part"]) == shown
-
-
-def test_a_world_may_lack_an_environment():
-    both = c.mean_curves(c.seed_curves(frames(("X-v0", "Y-v0"), 2, 40), RETURN), RETURN, QUESTIONED)
-    worlds = {"one": both[both["env"] == "X-v0"], "two": both}
-    names = {name: name for name in both["variant"].unique()}
-    look = c.plot_style(QUESTIONED, {"columns": 2}, names, dict.fromkeys(names, "k"))
-    panels = {axes.get_title(): axes for axes in draw_curves(worlds, RETURN, look).axes}
-    shown, curve = panels["Y-v0, two"].get_xlim(), both["episode"]
-    assert shown[0] <= curve.min() and shown[1] >= curve.max()
 
 
 @pytest.mark.parametrize(

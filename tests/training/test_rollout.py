@@ -59,12 +59,6 @@ def policy_of(environment: Environment, kind: str, seed: int) -> ActingPolicy:
     return acting(policy, np.zeros(size), np.ones(size), np.inf)
 
 
-def play(environment: Environment) -> Episode:
-    noise = draw_noise(environment, np.random.default_rng(0))
-    policy = uniform_policy(environment)
-    return rollout_for(environment, policy)(environment, policy, noise)
-
-
 @pytest.mark.parametrize("kind", ["erratic", "skilled"])
 @pytest.mark.parametrize("name", CLASSIC)
 def test_both_rollouts_play_the_same_episodes(name, kind):
@@ -212,22 +206,3 @@ def test_noise_is_drawn_up_to_the_time_limit():
     one, other = np.random.default_rng(0), np.random.default_rng(0)
     assert (draw_noise(environment_of("CartPole-v1"), one) == other.random(500)).all()
     assert (draw_noise(environment_of("Pendulum-v1"), one) == other.normal(size=(200, 1))).all()
-
-
-REPLAYED = [*CLASSIC, "HopperBulletEnv-v0", "Pendulum-v1", "SparseMountainCar-v0", "DeepSea10-v0"]
-REPLAYED += ["FrozenLake8x8Deterministic-v0", "BarrenRegion-v0"]
-
-
-@pytest.mark.parametrize("name", REPLAYED)
-def test_fresh_environment_with_an_aged_one_s_generator_replays_it(name):
-    """What resuming rests on; in Hopper the very first episode is unlike all later ones."""
-    aged, same, fresh = (environment_of(name, seed) for seed in (0, 0, 99))
-    policy = uniform_policy(aged)
-    roll = rollout_for(aged, policy)
-    noise = [draw_noise(aged, np.random.default_rng(number)) for number in range(6)]
-    for row in noise[:3]:
-        assert bits(roll(aged, policy, row)) == bits(roll(same, policy, row))
-    assert aged.generator.bit_generator.state != fresh.generator.bit_generator.state
-    fresh.generator.bit_generator.state = aged.generator.bit_generator.state
-    for row in noise[3:]:
-        assert bits(roll(aged, policy, row)) == bits(roll(fresh, policy, row))

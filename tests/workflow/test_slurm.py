@@ -16,13 +16,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 import pytest
 import yaml
 from shared import ROOT, contents, provenance_of
-from snakemake.cli import parse_args
 
 from mace_rl.base import files
 from mace_rl.runs import slurm
@@ -42,7 +40,6 @@ LONG = "HopperBulletEnv-v0"
 ON_SLURM = ["--workflow-profile", "profiles/slurm", "--group-components", "runs_18=18", "runs_2=2"]
 ON_SLURM += ["--slurm-init-seconds-before-status-checks", "5"]
 ON_SLURM += ["--seconds-between-status-checks", "5"]
-CLUSTER = "ClusterName=slurm-test"
 FIRST, SECOND = ("killed", "preempted"), "cancelled"  # in the first or second run of an entry
 
 
@@ -51,17 +48,10 @@ def unfit() -> str:
     missing = [name for name in PROGRAMS.split() if not shutil.which(name)]
     if missing:
         return f"{', '.join(missing)} missing; Debian and Ubuntu: apt-get install slurm-wlm munge"
-    if "SLURM_CONF" in os.environ or (CONFIGURATION.exists() and not left_over()):
+    if "SLURM_CONF" in os.environ or CONFIGURATION.exists():  # or left, when a machine stopped
         found = os.environ.get("SLURM_CONF", CONFIGURATION)
         return f"there is a Slurm configuration already, {found}; not touched"
     return "" if os.geteuid() == 0 else f"has to write {CONFIGURATION}, so it needs root"
-
-
-def left_over() -> bool:
-    """Is the configuration of such a test that could not take it away, as when a machine stops?"""
-    ours = CLUSTER in CONFIGURATION.read_text(encoding="utf-8").splitlines()
-    daemons = {"slurmctld", "slurmd"}
-    return ours and not daemons & {process.name() for process in psutil.process_iter()}
 
 
 def ask(*command: str) -> str:
@@ -74,7 +64,7 @@ def configuration(scratch: Path) -> str:
     node = ask("slurmd", "-C").splitlines()[0]
     name = node.split()[0].partition("=")[2]
     return f"""
-{CLUSTER}
+ClusterName=slurm-test
 SlurmctldHost={name}(127.0.0.1)
 SlurmUser=root
 AuthType=auth/munge
@@ -225,28 +215,6 @@ def disturb(process: subprocess.Popen[bytes], results: Path) -> dict[str, Path]:
     return hit
 
 
-@pytest.mark.parametrize(
-    ("found", "running", "refused"),
-    [
-        (f"\n{CLUSTER}\nSlurmUser=root\n", [], False),
-        (f"\n{CLUSTER}\nSlurmUser=root\n", ["slurmd"], True),
-        (f"# instead of {CLUSTER}\nClusterName=ours\n", [], True),
-    ],
-)
-def test_only_what_such_a_test_has_left_is_written_over(
-    found, running, refused, tmp_path, monkeypatch
-) -> None:
-    configuration = tmp_path / "slurm.conf"
-    configuration.write_text(found)
-    monkeypatch.setattr(sys.modules[__name__], "CONFIGURATION", configuration)
-    monkeypatch.setattr(sys.modules[__name__], "PROGRAMS", "")
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.delenv("SLURM_CONF", raising=False)
-    processes = [SimpleNamespace(name=lambda name=name: name) for name in ["init", *running]]
-    monkeypatch.setattr(psutil, "process_iter", lambda: iter(processes))
-    assert ("not touched" in unfit()) == refused
-
-
 @pytest.mark.slow
 @pytest.mark.slurm
 def test_a_study_on_a_cluster_with_mishaps_is_that_of_one_machine(scratch, cluster) -> None:
@@ -274,14 +242,6 @@ def test_a_study_on_a_cluster_with_mishaps_is_that_of_one_machine(scratch, clust
 # --- The profile ----------------------------------------------------------------------------------
 
 PROFILE = ROOT / "profiles" / "slurm" / "config.yaml"
-
-
-def test_snakemake_knows_every_key_of_the_profile() -> None:
-    _, arguments = parse_args(["--workflow-profile", str(PROFILE), "all"])
-    assert arguments.executor == "slurm"
-    assert arguments.retries == 3 and arguments.cores == 1 and arguments.slurm_requeue
-    sizes = arguments.group_components
-    assert sizes == {f"runs_{size}": size for size in sizes.values()}
 
 
 def test_the_profile_has_all_of_the_default_one() -> None:

@@ -23,7 +23,6 @@ LEARNS = {"kind": "custom", "rule": "test_extras:Noted", "arguments": {"learns":
     [
         (lambda s: s.update(discount=0.9), "made with discount 0.9, but here it is 0.99"),
         (lambda s: s.update(beta=0.5), "made with beta 0.5, but here it is {.* 0.4}"),
-        (lambda s: s.update(observation_space="Discrete"), "observation_space 'Discrete', but"),
         (lambda s: s.update(environments=2), "made with environments 2, but here it is 1"),
         (lambda s: s.pop("beta"), "made with beta unknown, but here it is {'kind'"),  # before it
         (lambda s: s.update(curves=3), "made with curves 3, but here it is unknown"),  # later
@@ -46,7 +45,6 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
         ({"beta": learned("credit")}, "of kind return, score, progress or words: policy gradients"),
         ({"beta": "learnt"}, "beta is 'learnt', but it should be a number, 'learned', or a rule"),
         ({"meta": {"chunks": 8}}, "meta is for a β that is 'learned'"),
-        ({"beta": "learned", "meta": {"chunk": 8}}, "unknown key 'meta.chunk' .* 'chunks'"),
         ({"beta": LEARNS}, "beta.rule has 'test_extras:Noted', which learns from policy"),
         ({"beta": {"kind": "none"}}, "'none'.*'constant', 'exponential', 'custom'"),
         ({"beta": 10.5}, "beta.value is 10.5, but .* less than or equal to 10"),
@@ -54,7 +52,6 @@ def test_a_state_made_with_other_settings_is_refused(change, message):
         ({"relevance": False, "memory": {}}, "relevance False does not use memory"),
         ({"novelty": {"kind": "counts"}}, "novelty.kind is 'counts', but the observations are Box"),
         ({"novelty": {"neighbours": [9000]}}, "neighbours has 9000, which must be less than"),
-        ({"discount": 1.1}, "discount is 1.1, but .* less than or equal to 1"),
         ({"seed": -1}, "seed is -1, but .* greater than or equal to 0"),
     ],
 )
@@ -117,11 +114,9 @@ def test_a_state_of_something_else_is_refused(state, message):
         (observing([GOOD, []]), ConfigError, r"\[\] of shape \(0,\) after step 1, but its obs"),
         # As numpy stretches.
         (observing([GOOD, [0]]), ConfigError, r"of shape \(1,\) after step 1"),
-        (observing([GOOD, [0] * 5]), ConfigError, r"of shape \(5,\) after step 1, but"),
         (observing([5, 6, 7, 8], THREE), ConfigError, "observation 8 of shape .* after step 3"),
         (observing([4], THREE), ConfigError, "observation 4 of shape .* after the reset"),
         (paying(np.nan), NonFiniteError, "the reward is nan after step 3"),
-        (paying(np.inf), NonFiniteError, "the reward is inf after step 3"),
         (paying(-1.7e308), NonFiniteError, r"reward is -1.7e\+308 after step 3, but float32"),
         (paying(None), ConfigError, "None as reward after step 3, but it should be one number"),
         (observing([GOOD, *BAD]), NonFiniteError, "observation is inf after step 1"),
