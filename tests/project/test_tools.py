@@ -25,10 +25,12 @@ def test_editors_are_told_what_a_configuration_may_be() -> None:
     kept = json.loads(schema.GOAL.read_text(encoding="utf-8"))
     assert kept == schema.schema(), "python -m tools.schema makes it anew"
     files = [ROOT / "config.yaml", *(ROOT / "config").rglob("*.yaml")]
+    files += [ROOT / "examples" / "environments.yaml", ROOT / "reference" / "runs.yaml"]
     for file in (file for file in files if file.name != "claims.yaml"):
         validate(read_yaml(file), str(schema.GOAL))
     for wrong in (
         "seeds=[-1]",
+        "seeds=3-",
         "training={ppo: {clp: 0.2}}",
         "training={novelty: {neighbours: 10}}",
         "environment_settings={CartPole-v1: {episodes: many}}",

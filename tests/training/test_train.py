@@ -348,7 +348,7 @@ def test_equal_states_have_equal_bytes():
     assert archive(apart) == archive(together)
 
 
-OTHERS = read_study([ROOT / "config.yaml", ROOT / "config" / "environments.yaml"])
+OTHERS = read_study([ROOT / "config.yaml", ROOT / "examples" / "environments.yaml"])
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,9 @@ class ShownVariant(Variant):
     imported: bool = False  # whether its runs are others', brought by `mace_study.imported`
 
 
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 SEEDS = r"(\d{1,10})-(\d{1,10})"
+Range = Annotated[str, Field(pattern=f"^{SEEDS}$")]
 MOST_SEEDS = 100_000  # of one environment
 
 
@@ -75,10 +77,10 @@ def _listed(seeds: Any) -> Any:
 
 
 Seeds = Annotated[
-    list[Annotated[int, Field(ge=0, lt=2**32)]],
+    list[Seed],
     Field(min_length=1),
     AfterValidator(once),
-    BeforeValidator(_listed, json_schema_input_type=int | str | list[int | str]),
+    BeforeValidator(_listed, json_schema_input_type=Seed | Range | list[Seed | Range]),
 ]
 
 
