@@ -107,12 +107,6 @@ def rows(environment: str, seed: int, horizon: int, config: list[Path]) -> list[
     return found
 
 
-def comparisons(effect: float, noise: float) -> float:
-    """Pairs of stretches that tell two βs apart: level 0.05, two-sided, with probability 0.8."""
-    quantiles = 1.959964 + 0.841621  # of the standard normal distribution
-    return 2 * (quantiles * noise / effect) ** 2 if effect else math.inf
-
-
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(

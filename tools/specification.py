@@ -9,12 +9,14 @@ from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
+from mace_study.compare import ceiling
 from mace_study.compare.comparisons import ALL, comparisons
 from mace_study.compare.specification import MOVES, asked_beta, specification
 from mace_study.config.metrics import MetricsConfig
@@ -33,6 +35,10 @@ WORLDS = {
     "tuned": ("tuned", dict.fromkeys(("Acrobot-v1", "CartPole-v1"), range(200, 240))),
     "plain": ("plain", {"Acrobot-v1": range(300, 500), "CartPole-v1": range(300, 400)}),
 }
+# What tools.ceiling wrote, with the world of each row; its controls are tasks of these files.
+CEILING = ROOT / "reference" / "measured" / "ceiling.csv"
+CONTROLS = [ROOT / "config" / "tasks.yaml", ROOT / "config" / "planted.yaml"]
+FIRST = 300  # episodes that it is about
 BASELINES = ("ppo", "mace_fixed")
 DEFAULT = "mace_full"
 READINGS = (
@@ -42,56 +48,63 @@ READINGS = (
 DECIDES = "robust"
 
 
-def measured(
-    path: Path, variant: str, seeds: range, settings: MetricsConfig
-) -> tuple[pd.DataFrame, list[float]] | None:
-    """Rows of metrics.csv and betas.csv of a variant's runs, and how far each asked β deviates.
+class Measured(NamedTuple):
+    """The runs of a variant in one environment."""
 
-    None where runs are lacking.
-    """
+    rows: pd.DataFrame  # of metrics.csv and betas.csv
+    deviations: list[float]  # how far the β that is asked for deviates, of each
+    first: dict[int, float]  # by seed the mean return of the episodes that the ceiling is about
+
+
+def measured(path: Path, variant: str, seeds: range, settings: MetricsConfig) -> Measured | None:
+    """A variant's runs; None where some are lacking."""
     there = kept_runs.read(path, [variant])
     if not {(variant, seed) for seed in seeds} <= {*there}:
         return None
-    frames, moved = {}, []
+    frames, moved, first = {}, [], {}
     for seed in seeds:
         record, frame = there[variant, seed]
         config = RunConfig.model_validate(json.loads(record)["config"])
         frames[config.environment, variant, seed] = frame
+        first[seed] = float(frame["extrinsic_return"][:FIRST].mean())
         if variant not in BASELINES:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     both = metrics_table(frames, settings), betas_table(frames, settings)
-    return both[0].merge(both[1], on=["env", "variant", "seed"]), moved
+    return Measured(both[0].merge(both[1], on=["env", "variant", "seed"]), moved, first)
 
 
 def asked(
     folder: Path, seeds: Mapping[str, range], settings: MetricsConfig, cores: int
-) -> tuple[pd.DataFrame, dict[str, float]]:
-    """The runs of one world, and of each reading that is complete there how much its β moves."""
-    jobs = [(name, env) for name in (*BASELINES, *READINGS) for env in seeds]
-    paths = [folder / f"{files.folder_of(env)}.parquet" for _, env in jobs]
-    variants, ranges = zip(*((name, seeds[env]) for name, env in jobs), strict=True)
+) -> dict[tuple[str, str], Measured]:
+    """By environment and variant the runs of one world, of those that are complete there."""
+    jobs = [(env, name) for name in (*BASELINES, *READINGS) for env in seeds]
+    paths = [folder / f"{files.folder_of(env)}.parquet" for env, _ in jobs]
+    ranges, variants = zip(*((seeds[env], name) for env, name in jobs), strict=True)
     with ProcessPoolExecutor(cores) as pool:
         made = pool.map(measured, paths, variants, ranges, repeat(settings))
-        found = dict(zip(jobs, made, strict=True))
-    whole = {
-        name: [part for env in seeds if (part := found[name, env]) is not None]
-        for name in (*BASELINES, *READINGS)
-    }
-    whole = {name: own for name, own in whole.items() if len(own) == len(seeds)}
+        found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
+    whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
     if lacking := [name for name in BASELINES if name not in whole]:
         raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
-    table = pd.concat([rows for own in whole.values() for rows, _ in own], ignore_index=True)
-    moved = {name: [one for _, runs in own for one in runs] for name, own in whole.items()}
-    return table, {name: statistics.median(moved[name]) for name in READINGS if name in whole}
+    return {job: runs for job, runs in found.items() if job[1] in whole}
 
 
 def make(kept: Path, goal: Path, cores: int) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
     study = read_study([ROOT / "config.yaml"])
-    found, compared, moved = [], [], {}
+    found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
         if (kept / place).exists():
-            table, deviations = asked(kept / place, seeds, study.metrics, cores)
+            runs = asked(kept / place, seeds, study.metrics, cores)
+            table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
+            by_reading: dict[str, list[float]] = {}
+            for (_, name), of_env in runs.items():
+                by_reading.setdefault(name, []).extend(of_env.deviations)
+            deviations = {
+                name: statistics.median(by_reading[name]) for name in READINGS if name in by_reading
+            }
+            first = {job: of_env.first for job, of_env in runs.items()}
+            earned.append(ceiling.over_ppo(first, study.metrics).assign(world=world))
             own = specification(table, study.metrics, ROOT / study.claims, deviations, DECIDES)
             found.append(own.assign(world=world))
             pairs = [[name, other] for name in deviations for other in BASELINES]
@@ -108,10 +121,68 @@ def make(kept: Path, goal: Path, cores: int) -> list[str]:
     betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
     betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
     save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
-    text = page("readings", ORIGIN, sections(answers, betas), ["specification"])
-    (goal / "README.md").write_text(text, encoding="utf-8")
-    names = ("specification.csv", "comparisons.csv", "deviations.csv", "specification.png")
-    return [*names, "README.md"]
+    told, pictures = sections(answers, betas), ["specification"]
+    names = ["specification.csv", "comparisons.csv", "deviations.csv"]
+    if CEILING.exists():
+        rows = pd.read_csv(CEILING)
+        metrics = read_study([ROOT / "config.yaml", *CONTROLS]).metrics
+        gains, effects = ceiling.gains(rows, metrics), ceiling.effects(rows, metrics)
+        both = pd.concat([of_oracle(rows, metrics), *earned], ignore_index=True)
+        for name, table in {"gains": gains, "effects": effects, "ceiling": both}.items():
+            table.to_csv(goal / f"{name}.csv", index=False)
+            names.append(f"{name}.csv")
+        save_figure(worlds.draw_gains(both), goal / "ceiling.png")
+        told, pictures = [*told, *of_ceiling(gains, effects)], [*pictures, "ceiling"]
+    (goal / "README.md").write_text(page("readings", ORIGIN, told, pictures), encoding="utf-8")
+    return [*names, *(f"{name}.png" for name in pictures), "README.md"]
+
+
+def of_oracle(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """What the oracle and β = 0.4 earn over PPO with the seeds of the ceiling, as `over_ppo`."""
+    found = []
+    for (world, horizon), own in rows.groupby(["world", "episodes"], sort=False):
+        named = own.assign(who=own["who"].replace("oracle", f"oracle, H = {horizon}"))
+        single = named.drop_duplicates(["env", "who", "seed"])
+        means = {
+            (str(env), str(who)): dict(zip(each["seed"], each["mean_return"], strict=True))
+            for (env, who), each in single.groupby(["env", "who"], sort=False)
+        }
+        found.append(ceiling.over_ppo(means, settings).assign(world=str(world)))
+    return pd.concat(found).drop_duplicates(["world", "env", "variant"])
+
+
+def of_ceiling(gains: pd.DataFrame, effects: pd.DataFrame) -> list[Section]:
+    """The tables of what any learner could gain."""
+    shown = gains.assign(
+        where=gains["env"] + " (" + gains["world"] + ")",
+        gained=[span(row, "gain", 1 if abs(row["mean"]) > 1 else 3) for _, row in gains.iterrows()],
+    )[["where", "episodes", "over", "seeds", "gained", "p_value"]].round({"p_value": 3})
+    note = (
+        "At every tenth of the first 300 episodes an oracle takes the β of 0, 0.1, 0.4 and 1 whose"
+        " four forks, of so many episodes, have the best mean. Gained: in the mean return of the"
+        " 300, over the same seeds."
+    )
+    told = effects.assign(
+        where=effects["env"] + " (" + effects["world"] + ")",
+        effect=[span(row, "effect", 2 if row["noise"] > 1 else 4) for _, row in effects.iterrows()],
+        noise=effects["noise"].map("{:.3g}".format),
+        needed=effects["needed"].map("{:,.0f}".format),
+    )[["where", "episodes", "stretch", "effect", "noise", "needed"]]
+    what = (
+        "What β = 1 earns over β = 0 in each of the next episodes (`stretch` of them), beside the"
+        " noise of one such stretch. *Needed*: episodes in all that tell the two apart with a"
+        " probability of 0.8, by this effect."
+    )
+    return [
+        Section("The most that any could gain", note, shown.map(str)),
+        Section("What β does to the next episodes", what, told.map(str)),
+    ]
+
+
+def span(row: pd.Series, name: str, digits: int) -> str:
+    """A value with its interval."""
+    value, low, high = (f"{row[key]:.{digits}f}".replace("-", "−") for key in (name, "low", "high"))
+    return f"{value} ({low} to {high})"
 
 
 ORIGIN = "By `make tables`, from the runs of [the protocol](../../readings/protocol.md)."

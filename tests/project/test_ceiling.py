@@ -1,12 +1,16 @@
 """The ceiling: forks repeat themselves; the oracle gains nothing where nothing helps."""
 
 import numpy as np
+import pandas as pd
 import pytest
+from invented import STUDY
+from scipy import stats
 from shared import finish
 
 from mace_rl.bonus.flag import FlagNovelty
 from mace_rl.library import settings
 from mace_rl.training.trainer import Trainer
+from mace_study.compare.ceiling import effects, gains, over_ppo, stretches
 from tools import ceiling
 
 
@@ -43,7 +47,7 @@ def test_effect_and_noise_by_hand():
     assert [stretch for stretch, *_ in found] == [1, 10, 20]
     assert [effect for _, effect, _ in found] == pytest.approx([3, 3, 1.5])
     assert [noise for *_, noise in found] == pytest.approx([np.std([0, 1], ddof=1)] * 3)
-    assert ceiling.comparisons(1.0, 1.0) == pytest.approx(15.7, abs=0.01)  # two samples, textbook
+    assert stretches(1.0, 1.0) == pytest.approx(15.7, abs=0.01)  # two samples, textbook
 
 
 @pytest.mark.slow
@@ -72,3 +76,42 @@ def test_a_mistake_gets_one_line(monkeypatch, capsys, tmp_path):
     with pytest.raises(SystemExit):
         ceiling.main()
     assert "--seeds should be FIRST < END" in capsys.readouterr().err
+
+
+def rows_by_hand(seeds: int = 5) -> pd.DataFrame:
+    """As tools.ceiling writes them, with a world: the oracle is near 30, PPO near 20."""
+    draws = np.random.default_rng(0)
+    found = []
+    for seed in range(800, 800 + seeds):
+        start = {"world": "plain", "env": "CartPole-v1", "seed": seed, "episodes": 20}
+        for who, level in (("oracle", 30.0), ("ppo", 20.0), ("beta_0.4", 25.0)):
+            own = start | {"who": who, "mean_return": level + draws.normal()}
+            stretches = (1, 10, 20) if who == "oracle" else (np.nan,)
+            for stretch in stretches:
+                numbers = {"effect": 2 + draws.normal(), "noise": 4 + draws.random(), "forks": 29}
+                found.append(own | {"stretch": stretch} | (numbers if who == "oracle" else {}))
+    return pd.DataFrame(found)
+
+
+def test_gains_and_effects_are_means_over_seeds_with_student_s_interval():
+    rows = rows_by_hand()
+    first = rows.drop_duplicates(["seed", "who"]).set_index(["who", "seed"])["mean_return"]
+    for row in gains(rows, STUDY.metrics).itertuples():
+        difference = first["oracle"] - first[row.over]
+        interval = stats.t.interval(0.95, 4, difference.mean(), stats.sem(difference))
+        assert (row.gain, row.low, row.high) == pytest.approx((difference.mean(), *interval))
+        assert (row.world, row.episodes, row.seeds) == ("plain", 20, 5)
+    oracle = rows[rows["who"] == "oracle"]
+    for row in effects(rows, STUDY.metrics).itertuples():
+        own = oracle[oracle["stretch"] == row.stretch]
+        assert row.effect == pytest.approx(own["effect"].mean())
+        assert row.noise == pytest.approx(np.sqrt(np.mean(own["noise"] ** 2)))
+        each = 2 * (2.801585 * row.noise / row.effect) ** 2
+        assert (row.stretches, row.needed) == pytest.approx((each, 2 * each * row.stretch))
+
+
+def test_gains_over_ppo_are_shares_of_all_there_is():
+    means = {("CartPole-v1", "ppo"): {3: 20.0, 4: 40.0}, ("CartPole-v1", "x"): {3: 30.0, 4: 60.0}}
+    ((env, variant, seeds, gain, low, high),) = over_ppo(means, STUDY.metrics).to_numpy()
+    everything = STUDY.metrics.reference_return[env] - STUDY.metrics.random_return[env]
+    assert (variant, seeds, gain) == ("x", 2, pytest.approx(15 / everything)) and low < gain < high

@@ -1,9 +1,8 @@
 # Around the jobs: one Snakemake at a time in a results folder, and what the terminal says of them.
 
-import fcntl
-import platform
 import textwrap
 
+from mace_study.around_jobs import occupy, outcome
 from snakemake.logging import LogEvent, logger
 
 # When Snakemake 9.27.1 is killed its jobs go on, so they end with it: workflow/scripts/job.py. On a
@@ -13,26 +12,6 @@ os.environ.update(MACE_RL_SNAKEMAKE_PID=str(os.getpid()))
 # that were done, too, and they come back from their last checkpoints.
 if workflow.remote_exec:
     os.environ.update(MACE_RL_KEEP_CHECKPOINTS="yes")
-
-
-def occupy(folder):
-    """Keep other Snakemakes out of `folder` as long as this process lives.
-
-    Snakemake's own lock (9.27.1) outlives a kill; profiles/default/config.yaml turns it off.
-    """
-    try:
-        os.makedirs(folder, exist_ok=True)
-        lock = open(f"{folder}/{files.LOCK}", "a+", encoding="utf-8")
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.seek(0)
-        sys.exit(f"Error: {lock.read() or 'another Snakemake'} is at work in {folder}; wait for it")
-    except OSError as error:
-        sys.exit(f"Error: the results folder {folder} cannot be used: {error.strerror}")
-    lock.truncate(0)
-    lock.write(f"Snakemake (process {os.getpid()} on {platform.node()})")
-    lock.flush()
-    return lock
 
 
 def in_short(record):
@@ -52,52 +31,17 @@ def in_short(record):
         said = [record.rule_msg, *(f"its log ends: {line}" for line in last)]
         record.rule_msg = "; ".join(filter(None, said)) or "it has no log"
     elif str(record.msg).startswith(LAST) and workflow.is_main_process and not workflow.dryrun:
-        record.msg = f"{record.msg}\n{outcome()}"
+        record.msg = f"{record.msg}\n{last_words()}"
     return True
 
 
-def outcome():
-    """Table 1, if it is among what was asked for, and where all of this lies.
-
-    Only of files that are there: with --touch, --until and the like Snakemake makes not all of them.
-    """
-    wanted = {str(path) for job in workflow.dag.jobs for path in job.output}
-    asked = {str(path) for job in workflow.dag.targetjobs for path in job.output}
-    made = set(filter(os.path.exists, wanted))
-    lines = []
-    if f"{RESULTS}/table1.csv" in made:
-        import pandas  # only now: it takes as long as planning
-
-        from mace_study.show import markdown, tables
-
-        names = {"dtype": {"variant": str}, "keep_default_na": False, "na_values": [""]}
-        data = pandas.read_csv(f"{RESULTS}/table1.csv", **names)
-        table = tables.table1(tables.named(data, study.labels), plan.measured, plan.paper.table1)
-        lines = [f"\n{title()}\n", markdown.plain(table), ""]
-    lie = [path for path in (f"{RESULTS}/{name}" for name in SHOWN) if path in made]
-    others = sorted(asked.intersection(made).difference(lie))
-    if len(others) > MOST_NAMED:
-        others = [f"{len(others)} files more in {RESULTS}"]
-    lines += textwrap.wrap(", ".join([*lie, *others]), 100)
-    of_all = {str(path) for job in workflow.dag.targetjobs if not job.output for path in job.input}
-    if missing := sorted(path for path in asked | of_all if not os.path.exists(path)):
-        more = f" and {len(missing) - 1} more" if missing[1:] else ""
-        lines.append(f"Not there, and not made now: {missing[0]}{more}")
-    return "\n".join(lines)
+def last_words():
+    jobs, targets = workflow.dag.jobs, workflow.dag.targetjobs
+    wanted, asked = ({str(path) for job in own for path in job.output} for own in (jobs, targets))
+    of_all = {str(path) for job in targets if not job.output for path in job.input}
+    return outcome(plan, wanted, asked, of_all)
 
 
-def title():
-    from mace_study.show.tables import counts_episodes
-
-    caption = plan.paper.table1.caption
-    name = f"Table 1: {caption[0].lower()}{caption[1:]}"
-    if not counts_episodes(plan.measured, plan.paper.table1):
-        return f"{name}; *: best"
-    return f"{name} in episodes; *: lowest; †k: k seeds never get there"
-
-
-SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
-MOST_NAMED = 24  # other files, by name
 LAST = ("Nothing to be done",)  # with which Snakemake ends; `onsuccess` knows another
 logger.addFilter(in_short)
 

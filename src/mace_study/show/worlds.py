@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from mace_study.compare.claims_config import Table1Config
+from mace_study.compare.estimates import CONFIDENCE
 from mace_study.compare.ledger import Answer, Judgement
 from mace_study.show.curves import (
     LEGEND_HEIGHT,
@@ -133,6 +134,35 @@ def draw_specification(table: pd.DataFrame, readings: Sequence[str]) -> Figure:
         for axes in panels[1:]:
             axes.set_yticks([])
         legend(figure, "Pale: without the claim's part in Hopper.")
+    return figure
+
+
+def draw_gains(table: pd.DataFrame) -> Figure:
+    """A panel per task: what each variant and the oracle earn over PPO, one axis for all.
+
+    table: of `mace_study.compare.ceiling.over_ppo`, with the column world.
+    """
+    groups = table.groupby(["world", "env"], sort=False)
+    names = list(dict.fromkeys(table["variant"]))
+    with style():
+        height = LINE * (1.4 * len(names) + 4)
+        below = "Gain over PPO in the first 300 episodes (1: what solving gives)"
+        figure, panels = grid(groups.ngroups, 2, below, height=height)
+        for ((world, env), own), axes in zip(groups, panels, strict=True):
+            axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
+            rows: Any = own.itertuples()
+            for row in rows:
+                place, oracle = names.index(row.variant), row.variant.startswith("oracle")
+                colour = COLOURS[2] if oracle else COLOURS[0]
+                axes.hlines(place, row.low, row.high, color=colour, linewidth=1.2)
+                label = "oracle" if oracle else "learned, fixed or constant β"
+                dot: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
+                axes.plot(row.gain, place, "o", **dot)
+            axes.set(title=f"{env} ({world})", ylim=(len(names) - 0.5, -0.5))
+            axes.set_yticks(range(len(names)), names, fontsize="x-small")
+        for axes in panels[1:]:
+            axes.sharex(panels[0])
+        legend(figure, f"Dot: mean over seeds. Bar: its {100 * CONFIDENCE:g} % interval.")
     return figure
 
 
