@@ -11,6 +11,7 @@ from mace_rl.bonus.flag import FlagNovelty
 from mace_rl.library import settings
 from mace_rl.training.trainer import Trainer
 from mace_study.compare.ceiling import effects, gains, over_ppo, stretches
+from mace_study.show.worlds import draw_gains
 from tools import ceiling
 
 
@@ -115,3 +116,15 @@ def test_gains_over_ppo_are_shares_of_all_there_is():
     ((env, variant, seeds, gain, low, high),) = over_ppo(means, STUDY.metrics).to_numpy()
     everything = STUDY.metrics.reference_return[env] - STUDY.metrics.random_return[env]
     assert (variant, seeds, gain) == ("x", 2, pytest.approx(15 / everything)) and low < gain < high
+
+
+def test_the_picture_has_a_panel_for_each_task_and_one_axis():
+    own = {"env": "CartPole-v1", "seeds": 20, "gain": 0.1, "low": 0.0, "high": 0.3}
+    rows = [own | {"world": "control", "variant": "oracle, H = 20", "low": -0.4}]
+    rows += [own | {"world": "plain", "variant": name} for name in ("oracle, H = 20", "mace_full")]
+    panels = draw_gains(pd.DataFrame(rows)).axes
+    assert [axes.get_title() for axes in panels] == ["CartPole-v1 (plain)", "CartPole-v1 (control)"]
+    assert len({axes.get_xlim() for axes in panels}) == 1
+    assert panels[0].get_xlim()[0] < -0.4 and panels[0].get_xlim()[1] > 0.3
+    labels = [[label.get_text() for label in axes.get_yticklabels()] for axes in panels]
+    assert labels == [["oracle, H = 20", "mace_full"], ["oracle, H = 20"]]

@@ -142,27 +142,29 @@ def draw_gains(table: pd.DataFrame) -> Figure:
 
     table: of `mace_study.compare.ceiling.over_ppo`, with the column world.
     """
-    groups = table.groupby(["world", "env"], sort=False)
-    names = list(dict.fromkeys(table["variant"]))
+    order = ["plain", "tuned"]
+    ranked = table["world"].map(lambda world: order.index(world) if world in order else len(order))
+    groups = table.iloc[np.argsort(ranked, kind="stable")].groupby(["world", "env"], sort=False)
+    most = int(table.groupby(["world", "env"]).size().max())
+    ends = table[["low", "high"]].to_numpy()
+    margin = 0.05 * np.ptp(ends)
     with style():
-        height = LINE * (1.4 * len(names) + 4)
-        below = "Gain over PPO in the first 300 episodes (1: what solving gives)"
-        figure, panels = grid(groups.ngroups, 2, below, height=height)
+        figure, panels = grid(groups.ngroups, 2, "Gain over PPO", height=LINE * (1.4 * most + 4))
         for ((world, env), own), axes in zip(groups, panels, strict=True):
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
             rows: Any = own.itertuples()
-            for row in rows:
-                place, oracle = names.index(row.variant), row.variant.startswith("oracle")
+            for place, row in enumerate(rows):
+                oracle = row.variant.startswith("oracle")
                 colour = COLOURS[2] if oracle else COLOURS[0]
                 axes.hlines(place, row.low, row.high, color=colour, linewidth=1.2)
                 label = "oracle" if oracle else "learned, fixed or constant β"
                 dot: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(row.gain, place, "o", **dot)
-            axes.set(title=f"{env} ({world})", ylim=(len(names) - 0.5, -0.5))
-            axes.set_yticks(range(len(names)), names, fontsize="x-small")
-        for axes in panels[1:]:
-            axes.sharex(panels[0])
-        legend(figure, f"Dot: mean over seeds. Bar: its {100 * CONFIDENCE:g} % interval.")
+            axes.set(title=f"{env} ({world})", ylim=(most - 0.5, -0.5))
+            axes.set_xlim(ends.min() - margin, ends.max() + margin)
+            axes.set_yticks(range(len(own)), list(own["variant"]), fontsize="x-small")
+        shares = "In the first 300 episodes, as shares of what solving gives."
+        legend(figure, f"{shares} Bar: {100 * CONFIDENCE:g} % interval over seeds.")
     return figure
 
 
