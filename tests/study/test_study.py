@@ -101,6 +101,9 @@ variant_settings: {x: {beta: BETA, bonus: OWN, memory: {capacity: 9}}}  # 'memor
 variant_settings: {x: {beta: BETA, bonus: BARE, memory: {capacity: 9}}}  # 'memory', bonus.relevance
 seeds: [0, 1, 0]  # seeds, [0, 1, 0], 0 should be there once
 seeds: [4294967296]  # seeds.0, 4294967296
+environment_variants: {CartPole-v1: [mace_score]}  # environment_variants.CartPole-v1, ppo
+environment_variants: {CartPole-v1: [mace_ful]}  # environment_variants.CartPole-v1, 'mace_ful'
+seeds: 5-3  # seeds, '5-3', FIRST-LAST
 environment_seeds: {HopperBulletEnvv0: [3]}  # environment_seeds, 'HopperBulletEnvv0', nearest
 results: 2024.10  # results, 2024.1, text, quotes
 results: LONG  # results, 'xxx, at most 255
@@ -114,6 +117,17 @@ training: {memory: {capacity: 1000000000000}}  # memory.capacity, less than or e
 WORDS = {"CONFIG": str(CONFIG), "LONG": 256 * "x", "BETA": "{kind: constant, value: 1.0}"}
 WORDS |= {"OWN": "{kind: custom, estimator: 'test_extras:Fixed'}"}
 WORDS |= {"BARE": "{kind: curiosity, relevance: false}"}
+
+
+def test_seeds_may_be_ranges_and_an_environment_may_have_some_variants_only() -> None:
+    few = {"environment_variants": {"CartPole-v1": ["mace_full", "ppo"]}, "seeds": ["0-2", 7]}
+    study = load_study(changed(few | {"environment_seeds": {"CartPole-v1": "4-5"}}), "here")
+    found = [run for run in study.runs() if run[0] == "CartPole-v1"]
+    assert found == [
+        ("CartPole-v1", name, seed) for name in ("ppo", "mace_full") for seed in (4, 5)
+    ]
+    others = [run[1:] for run in study.runs() if run[0] == "Acrobot-v1"]
+    assert others == [(name, seed) for name in study.variants for seed in (0, 1, 2, 7)]
 
 
 @pytest.mark.parametrize("line", MISTAKES.strip().splitlines())

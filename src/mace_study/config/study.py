@@ -186,6 +186,11 @@ def load_study(config: Mapping[Any, Any], origin: str) -> Study:
                 check_known(variant, study.variant_settings, key, "variant_settings")
         for environment in study.environments:
             study.metrics.random_return_in(environment)  # there has to be one
+        for environment, variants in study.variants_of.items():
+            if not variants:
+                raise ConfigError(
+                    f"environment_variants.{environment} has none of variants, {study.variants}"
+                )
         by_environment = {
             "environment_seeds": study.environment_seeds,
             "environment_variants": study.environment_variants,
