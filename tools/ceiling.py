@@ -31,9 +31,10 @@ from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
 from mace_rl.library import settings
 from mace_rl.training.trainer import Trainer
+from mace_study.compare.ceiling import LAST
 
 GRID, STREAMS = (0.0, 0.1, 0.4, 1.0), 4
-STEP, LAST = 10, 300  # episodes from fork to fork, and until the last one's
+STEP = 10  # episodes from fork to fork
 STRETCHES = (1, 10)  # episodes over which an effect is measured, beside H
 COLUMNS = ("env", "seed", "episodes", "who", "mean_return", "stretch", "effect", "noise", "forks")
 

@@ -12,7 +12,6 @@ import argparse
 import hashlib
 import json
 import sys
-import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -27,10 +26,10 @@ from pyarrow import parquet
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
+from mace_rl.base.files import write_atomically
 from mace_rl.config.run import RunConfig
-from mace_rl.runs import run as training
+from mace_rl.runs import verify
 from mace_rl.runs.finished import FinishedRun
-from mace_rl.runs.provenance import difference
 
 LONGEST = 60  # seconds of a run that is trained again
 COLUMNS = {
@@ -114,12 +113,11 @@ def write(path: Path, runs: Runs) -> None:
         "digest": digests,
     }
     table = pa.table(keys | {name: _packed(name, lists) for name, lists in columns.items()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
     split = [f"{name}.list.element" for name in ("length", "extrinsic_return", "beta")]
     encodings: dict[str, str] = dict.fromkeys(split, "BYTE_STREAM_SPLIT")
+    sink = pa.BufferOutputStream()
     with parquet.ParquetWriter(
-        temporary,
+        sink,
         table.schema,
         compression="brotli",
         compression_level=11,
@@ -129,7 +127,8 @@ def write(path: Path, runs: Runs) -> None:
     ) as file:
         for variant in dict.fromkeys(keys["variant"]):
             file.write_table(table.filter(pc.equal(table["variant"], variant)))
-    temporary.replace(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, sink.getvalue().to_pybytes())
 
 
 def _packed(name: str, lists: list[np.ndarray]) -> pa.Array:
@@ -169,20 +168,6 @@ def pack(results: Path, folder: Path) -> int:
     return count
 
 
-def repeat(run: Kept) -> tuple[bool, str]:
-    """Train as a kept run was: whether all its files are equal, and a line about it."""
-    record = json.loads(run.record)
-    config = RunConfig.model_validate(record["config"])
-    with tempfile.TemporaryDirectory() as temporary:
-        training.run(config, Path(temporary))
-        now = FinishedRun(temporary, trust=True)
-        same = now.episodes[run.episodes.columns].equals(run.episodes)
-    equal = same and now.record["outputs"] == record["outputs"]
-    name = f"{config.environment} {config.variant} seed {config.seed}"
-    how = "equal to the bit" if equal else f"different ({difference(record, now.record)})"
-    return equal, f"{name}: {how}"
-
-
 def sample(folder: Path, count: int) -> Iterator[Kept]:
     """Short runs of `count` variants, at random but always the same; `ValueError` if too few."""
     draws, left = np.random.default_rng(0), count
@@ -194,10 +179,12 @@ def sample(folder: Path, count: int) -> Iterator[Kept]:
         )
     ]
     for place in draws.permutation(len(variants)):
+        if not left:
+            return
         path, variant = variants[place]
         runs = [*read(path, [variant]).values()]
         run = runs[draws.choice(len(runs))]
-        if left and json.loads(run.record)["seconds"] < LONGEST:
+        if json.loads(run.record)["seconds"] < LONGEST:
             left -= 1
             yield run
     if left:
@@ -226,7 +213,9 @@ def main() -> None:
             raise ValueError("--sample is a number of runs, at least 1")
         equal = []
         for run in sample(arguments.folder, arguments.sample):
-            same, line = repeat(run)
+            record = json.loads(run.record)
+            config = RunConfig.model_validate(record["config"])
+            same, line = verify.repeated(config, record, run.episodes)
             equal.append(same)
             print(line, flush=True)
         print(f"{sum(equal)} of {len(equal)} runs equal to the bit")

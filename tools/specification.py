@@ -38,7 +38,6 @@ WORLDS = {
 # What tools.ceiling wrote, with the world of each row; its controls are tasks of these files.
 CEILING = ROOT / "reference" / "measured" / "ceiling.csv"
 CONTROLS = [ROOT / "config" / "tasks.yaml", ROOT / "config" / "planted.yaml"]
-FIRST = 300  # episodes that it is about
 BASELINES = ("ppo", "mace_fixed")
 DEFAULT = "mace_full"
 READINGS = (
@@ -66,7 +65,7 @@ def measured(path: Path, variant: str, seeds: range, settings: MetricsConfig) ->
         record, frame = there[variant, seed]
         config = RunConfig.model_validate(json.loads(record)["config"])
         frames[config.environment, variant, seed] = frame
-        first[seed] = float(frame["extrinsic_return"][:FIRST].mean())
+        first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
         if variant not in BASELINES:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     both = metrics_table(frames, settings), betas_table(frames, settings)
@@ -156,11 +155,12 @@ def of_ceiling(gains: pd.DataFrame, effects: pd.DataFrame) -> list[Section]:
     shown = gains.assign(
         where=gains["env"] + " (" + gains["world"] + ")",
         gained=[span(row, "gain", 1 if abs(row["mean"]) > 1 else 3) for _, row in gains.iterrows()],
-    )[["where", "episodes", "over", "seeds", "gained", "p_value"]].round({"p_value": 3})
+        p=gains["p_value"].map("{:.4f}".format),
+    )[["where", "episodes", "over", "seeds", "gained", "p"]]
     note = (
-        "At every tenth of the first 300 episodes an oracle takes the β of 0, 0.1, 0.4 and 1 whose"
-        " four forks, of so many episodes, have the best mean. Gained: in the mean return of the"
-        " 300, over the same seeds."
+        f"At every tenth of the first {ceiling.LAST} episodes an oracle takes the β of 0, 0.1, 0.4"
+        " and 1 whose four forks, of so many episodes, have the best mean. Gained: in the mean"
+        " return of these, over the same seeds. *p*: of no difference."
     )
     told = effects.assign(
         where=effects["env"] + " (" + effects["world"] + ")",

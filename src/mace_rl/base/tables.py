@@ -21,7 +21,7 @@ class RecordError(Refusal, ValueError):
 
 
 def read_table(path: str | Path, columns: Mapping[str, type]) -> "pd.DataFrame":
-    """A CSV file with exactly the `columns`, each int, float or str, as a frame."""
+    """What `read_columns` reads and judges, as a frame."""
     import pandas as pd
 
     table = read_columns(path, columns)

@@ -4,15 +4,20 @@ With the same versions they are equal on every processor; with others a last bit
 """
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
+from mace_rl.config.run import RunConfig
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.runs.provenance import difference
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class NotReproducedError(Refusal):
@@ -21,25 +26,32 @@ class NotReproducedError(Refusal):
 
 def repeat(then: FinishedRun) -> tuple[bool, str]:
     """Train as `then` was: whether records and agent are equal, and a line about it."""
-    from mace_rl.runs.run import run  # PyTorch takes seconds to import
-
-    config, before = then.config, then.episodes
     for name in files.RESULTS:
         if (then.folder / name).exists():  # a kept run may have its episodes only
             then.content(name)
+    return repeated(then.config, then.record, then.episodes)
+
+
+def repeated(
+    config: RunConfig, record: Mapping[str, Any], before: "pd.DataFrame"
+) -> tuple[bool, str]:
+    """The same of a run with this `run.json` and these columns of `episodes.csv`."""
+    from mace_rl.runs.run import run  # numba takes a second to import
+
     with tempfile.TemporaryDirectory() as temporary:
         run(config, Path(temporary))
-        now = FinishedRun(temporary)
-        after = now.episodes
+        now = FinishedRun(temporary, trust=True)
+        after = now.episodes[before.columns]
     name = f"{config.environment} {config.variant} seed {config.seed}"
-    outputs = [record["outputs"] for record in (then.record, now.record)]
-    if outputs[0] == outputs[1]:
+    records = record, now.record
+    outputs = [one["outputs"] for one in records]
+    different = (before != after).any(axis=1).to_numpy()
+    if outputs[0] == outputs[1] and not different.any():
         return True, f"{name}: equal to the bit"
     old, new = (
         {key: one[key] for key in ("versions", "sources")} | {"cpu": one["machine"].get("cpu")}
-        for one in (then.record, now.record)
+        for one in records
     )
-    different = (before != after).any(axis=1).to_numpy()
     first = f"from episode {different.argmax() + 1}"
     others = [name for name in files.RESULTS if outputs[0].get(name) != outputs[1].get(name)]
     where = first if different.any() else f"in {' and '.join(others)} only"

@@ -14,6 +14,7 @@ from mace_study.config.metrics import MetricsConfig
 
 ORACLE, PPO = "oracle", "ppo"
 KEY = ["world", "env", "episodes"]  # of a row of tools.ceiling: `episodes` is the horizon H
+LAST = 300  # episodes that are forked, and whose mean return is reported
 QUANTILES = 1.959964 + 0.841621  # of a level of 0.05, two-sided, and a probability of 0.8
 
 

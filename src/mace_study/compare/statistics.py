@@ -265,5 +265,5 @@ def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndar
         return np.full((2, *estimates.shape[1:]), np.nan)
     wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
     tail = 100 * scipy.special.ndtr(-wider)
-    together = np.ascontiguousarray(np.moveaxis(estimates, 0, -1))  # in two thirds of the time
+    together = np.ascontiguousarray(np.moveaxis(estimates, 0, -1))  # sorted faster
     return np.percentile(together, [tail, 100 - tail], axis=-1, overwrite_input=True)

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from mace_study.compare.ceiling import LAST
 from mace_study.compare.claims_config import Table1Config
 from mace_study.compare.estimates import CONFIDENCE
 from mace_study.compare.ledger import Answer, Judgement
@@ -163,7 +164,7 @@ def draw_gains(table: pd.DataFrame) -> Figure:
             axes.set(title=f"{env} ({world})", ylim=(most - 0.5, -0.5))
             axes.set_xlim(ends.min() - margin, ends.max() + margin)
             axes.set_yticks(range(len(own)), list(own["variant"]), fontsize="x-small")
-        shares = "In the first 300 episodes, as shares of what solving gives."
+        shares = f"In the first {LAST} episodes, as shares of what solving gives."
         legend(figure, f"{shares} Bar: {100 * CONFIDENCE:g} % interval over seeds.")
     return figure
 
