@@ -26,6 +26,7 @@ import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equa
 
 import pandas as pd
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
@@ -88,7 +89,7 @@ def _make(name: str) -> tuple[int, list[str]]:
         seconds = sum(record["seconds"] for record in records)
         results.judge(*made, plan.paper, command, seconds)
     results.write_page(*made, plan.paper, plan.tabulated, pictures, command, plan.judged)
-    results.draw(folder, pictures, *made[1:], plan.paper, plan.style, plan.judged)
+    results.draw(folder, pictures, *made[1:], plan.paper, plan.style, plan.judged, kinds=["png"])
     wanted = [*OF_ALL, *(OF_PAPERS if papers else ()), *(f"{one}.png" for one in pictures)]
     write_readme(name)
     return len(frames), [*dict.fromkeys(o for o in wanted if (folder / o).exists()), README]
@@ -165,8 +166,9 @@ def main() -> None:
     os.chdir(ROOT)
     if MADE.exists():
         shutil.rmtree(MADE)
+    threadpool_limits(1)  # in each process
     try:
-        with ProcessPoolExecutor(min(cores, len(STUDIES))) as pool:
+        with ProcessPoolExecutor(cores) as pool:
             made = dict(zip(STUDIES, pool.map(make, STUDIES), strict=True))
     except ValueError as error:
         sys.exit(f"tables: {error}")

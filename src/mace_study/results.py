@@ -136,8 +136,9 @@ def draw(
     paper: ClaimsConfig,
     style: Mapping[str, Any],
     judged: bool,
+    kinds: Iterable[str] = ("png", "pdf"),
 ) -> None:
-    """Figures and pictures, each as PDF and PNG, from the data that is in `folder`.
+    """Figures and pictures, as files of these kinds, from the data that is in `folder`.
 
     style: of `plot_style`; judged: whether there is a ledger.
     """
@@ -148,7 +149,6 @@ def draw(
     data, answers = sections.read_data(files, runs, settings)
     look = curves.plot_style(settings, **style)
     for name in names:
-        both = folder / f"{name}.pdf", folder / f"{name}.png"
         if name in pictures.PICTURES:
             picture = pictures.PICTURES[name]
             table = picture.data(pictures.Source(data, answers, settings, paper))
@@ -160,5 +160,4 @@ def draw(
             own = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
             means, seeds = map(curves.read_curves, own)
             figure = curves.draw_figure(means, seeds, shown, look)
-        # The first layout differs a little, and readings.png was always that.
-        curves.save_figure(figure, *(both[::-1] if name == "readings" else both))
+        curves.save_figure(figure, *(folder / f"{name}.{kind}" for kind in kinds))

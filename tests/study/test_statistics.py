@@ -78,6 +78,18 @@ def test_paired_comparison_against_scipy_and_enumeration():
     assert one.difference == 16 and np.isnan(one[1:]).all()
 
 
+def test_a_tie_is_one_whatever_rounding_makes_of_it():
+    """Many sign patterns of whole numbers have the same small sum, in any unit."""
+    whole = np.array([-40, 24, -4, -25, 14, -17, -25, -37, 10, -12, 13, 33, 4, 7, -39, 16, 9, 70])
+    drawn = generator()
+    s.draws(len(whole), 10_000, drawn)  # for the interval
+    sums = s.signs(10_000, len(whole), drawn).astype(int) @ whole
+    sides = np.sum(sums <= whole.sum()), np.sum(sums >= whole.sum())
+    for unit in (1.0, 0.001, 1 / 3):
+        found = s.paired_comparison(whole * unit, 0.95, 10_000, generator()).p_value
+        assert found == pytest.approx(2 * (1 + min(sides)) / 10_001)
+
+
 def test_stratified_comparison():
     draws = generator()
     strata = [draws.normal(1.0, 1, 20), draws.normal(0.2, 3, 12)]

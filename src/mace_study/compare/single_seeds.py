@@ -89,18 +89,18 @@ def places(values: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 def first_in(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """In how many columns each variant alone is lowest, of every draw of a row each.
 
-    cells: by variant its rows, [seeds, columns]. Returns by variant int64 [seeds of the first,
+    cells: by variant its rows, [seeds, columns]. Returns by variant uint8 [seeds of the first,
     seeds of the second, ...].
     """
     count = len(cells)
-    spread = {
-        name: np.expand_dims(rows, [axis for axis in range(count) if axis != place])
+    spread = {  # [columns, 1, ..., seeds, ..., 1]: sums over the first axis are the fast ones
+        name: np.expand_dims(rows.T, [axis + 1 for axis in range(count) if axis != place])
         for place, (name, rows) in enumerate(cells.items())
     }
     won = {}
     for name, rows in spread.items():
         others = [other for key, other in spread.items() if key != name]
-        won[name] = np.sum(rows < reduce(np.minimum, others), axis=-1)
+        won[name] = np.sum(rows < reduce(np.minimum, others), axis=0, dtype=np.uint8)
     return won
 
 
@@ -138,4 +138,4 @@ def _unusual_when_drawn(own: np.ndarray) -> np.ndarray:
 
 def _shares(counts: np.ndarray, most: int) -> np.ndarray:
     """Which share of `counts` is 0, 1, ..., `most`."""
-    return np.bincount(counts.ravel(), minlength=most + 1) / counts.size
+    return np.array([np.mean(counts == value) for value in range(most + 1)])
