@@ -97,7 +97,7 @@ def first_in(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         name: np.expand_dims(rows.T, [axis + 1 for axis in range(count) if axis != place])
         for place, (name, rows) in enumerate(cells.items())
     }
-    won = {}
+    won: dict[str, np.ndarray] = {}
     for name, rows in spread.items():
         others = [other for key, other in spread.items() if key != name]
         won[name] = np.sum(rows < reduce(np.minimum, others), axis=0, dtype=np.uint8)
