@@ -76,7 +76,6 @@ lint: setup ## check style, types and workflow
 	$(IN_VENV) ruff format --no-cache --check .
 	$(IN_VENV) mypy
 	$(IN_VENV) snakefmt --check Snakefile workflow
-	$(IN_VENV) tools.lint_workflow
 	.venv/bin/actionlint
 
 setup: ## only create .venv from environment.lock

@@ -9,7 +9,7 @@ from importlib import import_module
 from benchmarks import page
 from benchmarks.measuring import FULL, QUICK, replace_section
 
-SECTIONS = ("speed", "purejaxrl", "breakdown", "growth", "minigrid", "workflow")
+SECTIONS = ("speed", "purejaxrl", "breakdown")
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Where a training's time goes, by part of the program; `bounds` says what bounds it.
+"""Where a training's time goes, by part of the program.
 
 The program has no timers of its own: its functions are wrapped here from outside.
 """
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from benchmarks.bounds import BOUNDS, Work
 from benchmarks.measuring import (
     CARTPOLE,
     ENVIRONMENTS,
@@ -86,31 +85,17 @@ class Stopwatch:
 
 
 def measure(scale: Scale) -> list[dict[str, Any]]:
-    """A row for each part of each of our trainings, and for each of `BOUNDS`."""
+    """A row for each part of each of our trainings."""
     rows: list[dict[str, Any]] = []
     for environment in ENVIRONMENTS:
         for contestant in OURS:
             what = contestant, environment, FIRST_SEED, scale.steps[environment]
             steps, found = in_fresh_process(profile, *what)
             identity = {"env": environment, "contestant": contestant, "steps": steps}
-            found |= in_fresh_process(bounds, *what)
             rows += [
-                identity | {"part": part, "seconds": found.get(part, 0.0)}
-                for part in (*ALL_SECTIONS, *BOUNDS)
+                identity | {"part": part, "seconds": found.get(part, 0.0)} for part in ALL_SECTIONS
             ]
     return rows
-
-
-def bounds(contestant: str, environment: str, seed: int, steps: int) -> dict[str, float]:
-    """Seconds that the same training cannot do without, by `BOUNDS`."""
-    from mace_rl.training.trainer import Trainer
-
-    trainer, work = Trainer(our_config(contestant, environment, seed)), Work()
-    work.watch(trainer)
-    for records in trainer.run():
-        if records[-1].env_steps >= steps:
-            break
-    return work.seconds()
 
 
 def profile(

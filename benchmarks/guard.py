@@ -1,29 +1,29 @@
-"""Did a change make training slower? CPU time a step, in pairs with another commit.
+"""Did a change make something slower? CPU time, in pairs with another commit.
 
-    make bench BENCH=quick            the working tree against the last commit, or, if nothing is
-                                      changed, the last commit against the one before
+    make bench BENCH=quick            a training's step, of the working tree against the last
+                                      commit, or, if nothing is changed, that against the one before
     python -m benchmarks.guard REV    against another one, with as many pairs as --pairs says
-    python -m benchmarks.guard --count    instructions a step, by valgrind: a quarter of an hour
+    python -m benchmarks.guard --tables    all that `make tables` does, some minutes a pair
 
 Each reading is a process of its own, and the two of a pair follow each other, now one first, now
 the other: what slows the machine down for a while hits both. Beside other work that can still be a
-tenth. Instructions do not feel it.
+tenth.
 """
 
 import argparse
 import os
-import re
-import shutil
+import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 
 from benchmarks.measuring import ACROBOT, CARTPOLE, FIRST_SEED, ROOT, THREADS
 from benchmarks.speed import WARM_UP_STEPS
 
-TRAININGS = [(env, who) for env in (CARTPOLE, ACROBOT) for who in ("ppo", "mace_full")]
 STEPS = 61_440  # of a reading, after a warm-up
 PAIRS = 5
 READ = """
@@ -38,80 +38,63 @@ found = read_clock(start(who, env, seed, steps), steps)
 print(1e6 * found["cpu_seconds"] / found["steps"])
 """
 
-# The same training without a clock; it prints its steps.
-COUNTED = """
-import sys
-import tools
-import torch
-from benchmarks.speed import start
-torch.set_num_threads(1)
-who, env, seed, steps = *sys.argv[1:3], *map(int, sys.argv[3:])
-print(next(done for done in start(who, env, seed, steps) if done >= steps))
-"""
-FEW, MANY = 4500, 18_000  # steps: the difference leaves out imports and the first updates
-VALGRIND = ["valgrind", "--tool=cachegrind", "--cache-sim=no", "--cachegrind-out-file=/dev/null"]
-# It knows no AVX-512.
-AVX2 = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
 
-
-def microseconds(tree: Path, who: str, env: str, seed: int, steps: int) -> float:
+def microseconds(who: str, env: str, steps: int, tree: Path, seed: int) -> float:
     """CPU time a step of a training by the code in `tree`, in a process of its own."""
     numbers = map(str, (seed, steps, WARM_UP_STEPS))
     command = [sys.executable, "-c", READ, who, env, *numbers]
-    return float(run_in(tree, command).stdout.split()[-1])
+    run = run_in(tree, command, **dict.fromkeys(THREADS, "1"))
+    if run.returncode:
+        sys.exit(f"guard: {tree}: {' '.join(command[-4:])} ended with {run.stderr.strip()[-300:]}")
+    return float(run.stdout.split()[-1])
 
 
-def instructions(tree: Path, who: str, env: str, few: int = FEW, many: int = MANY) -> float:
-    """Instructions a step of a training by the code in `tree`, between two numbers of steps."""
-
-    def command(steps: int) -> list[str]:
-        return [sys.executable, "-c", COUNTED, who, env, str(FIRST_SEED), str(steps)]
-
-    run_in(tree, command(many), **AVX2)  # compiles what the others load
-    found = []
-    for steps in (few, many):
-        run = run_in(tree, [*VALGRIND, *command(steps)], **AVX2)
-        count = re.search(r"I\s+refs:\s+([\d,]+)", run.stderr)
-        if count is None:
-            sys.exit(f"guard: valgrind ended with {run.stderr.strip()[-300:]}")
-        found.append((int(run.stdout.split()[-1]), int(count[1].replace(",", ""))))
-    (first, before), (last, after) = found
-    return (after - before) / (last - first)
+def tables(tree: Path, seed: int) -> float:
+    """CPU time of all tables and figures, by the code in `tree`, in seconds."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run = run_in(tree, [sys.executable, "-m", "tools.tables"])
+    if "tables and figures of" not in run.stdout:  # these may differ from what is kept
+        sys.exit(f"guard: {tree}: tools.tables ended with {run.stderr.strip()[-300:]}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def run_in(tree: Path, command: list[str], **more: str) -> subprocess.CompletedProcess[str]:
-    """A finished process that imports the code in `tree`; ends everything if it failed."""
-    changes = dict.fromkeys(THREADS, "1") | {"PYTHONPATH": f"{tree / 'src'}:{tree}"} | more
-    environment = os.environ | changes
-    run = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
-    if run.returncode:
-        sys.exit(f"guard: {tree}: {' '.join(command[-4:])} ended with {run.stderr.strip()[-300:]}")
-    return run
+    """A finished process that imports the code in `tree`."""
+    environment = os.environ | {"PYTHONPATH": f"{tree / 'src'}:{tree}"} | more
+    return subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
 
 
 def compare(
-    before: Path, now: Path, env: str, who: str, pairs: int, steps: int
+    before: Path, now: Path, read: Callable[[Path, int], float], pairs: int
 ) -> list[tuple[float, float]]:
-    """Of each pair the readings of both trees, in microseconds a step.
+    """Of each pair what `read` says of both trees; it gets a seed.
 
     One of each comes before and is thrown away: it compiles what the others load.
     """
     for tree in (before, now):
-        microseconds(tree, who, env, FIRST_SEED + pairs, steps)
+        read(tree, FIRST_SEED + pairs)
     found = []
     for pair in range(pairs):
         order = (before, now) if pair % 2 == 0 else (now, before)
-        one = {tree: microseconds(tree, who, env, FIRST_SEED + pair, steps) for tree in order}
-        found.append((one[before], one[now]))
+        both = {tree: read(tree, FIRST_SEED + pair) for tree in order}
+        found.append((both[before], both[now]))
     return found
 
 
-def row(env: str, who: str, found: list[tuple[float, float]]) -> str:
+def row(name: str, found: list[tuple[float, float]]) -> str:
     """A line of the table; above 1 it is slower now."""
     ratios = sorted(after / earlier for earlier, after in found)
     earlier, after = (median(pair[side] for pair in found) for side in (0, 1))
     spread = f"{ratios[0]:.2f} to {ratios[-1]:.2f}"
-    return f"| {env} `{who}` | {earlier:.1f} | {after:.1f} | {median(ratios):.2f} ({spread}) |"
+    return f"| {name} | {earlier:.1f} | {after:.1f} | {median(ratios):.2f} ({spread}) |"
+
+
+STEPS_OF = {
+    f"{env} `{who}`": partial(microseconds, who, env, STEPS)
+    for env in (CARTPOLE, ACROBOT)
+    for who in ("ppo", "mace_full")
+}
 
 
 def git(*arguments: str) -> bytes:
@@ -131,12 +114,9 @@ def main() -> None:
     )
     which = "a commit (default: the last, or the one before)"
     parser.add_argument("revision", nargs="?", help=which)
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument("--pairs", type=int, default=PAIRS, help="default: %(default)s")
-    how.add_argument("--count", action="store_true", help="instructions, by valgrind")
+    parser.add_argument("--pairs", type=int, default=PAIRS, help="default: %(default)s")
+    parser.add_argument("--tables", action="store_true", help="of `make tables`")
     arguments = parser.parse_args()
-    if arguments.count and not shutil.which("valgrind"):
-        parser.error("--count needs valgrind (Debian, Ubuntu: apt install valgrind)")
     if arguments.pairs < 1:
         parser.error(f"--pairs is {arguments.pairs}, but should be at least 1")
     changed = git("status", "--porcelain", "--untracked-files=no", "--", "src").strip()
@@ -145,19 +125,13 @@ def main() -> None:
         archive = git("archive", revision)
         subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
         name = git("log", "-1", "--format=%h %s", revision).decode().strip()
-        what = "instructions" if arguments.count else "µs of CPU time"
-        print(f"{what} a step, before: {name}\n", flush=True)
-        which = "now ÷ before" + ("" if arguments.count else ", median of pairs (least to most)")
-        print(f"| | before | now | {which} |")
+        what = "s of CPU time" if arguments.tables else "µs of CPU time a step"
+        print(f"{what}, before: {name}\n", flush=True)
+        print("| | before | now | now ÷ before, median of pairs (least to most) |")
         print("|---|--:|--:|--:|")
-        for env, who in TRAININGS:
-            if arguments.count:
-                earlier, after = (instructions(tree, who, env) for tree in (Path(folder), ROOT))
-                cells = f"{earlier:,.0f} | {after:,.0f} | {after / earlier:.3f}"
-                print(f"| {env} `{who}` | {cells} |", flush=True)
-            else:
-                found = compare(Path(folder), ROOT, env, who, arguments.pairs, STEPS)
-                print(row(env, who, found), flush=True)
+        timed = {"`make tables`": tables} if arguments.tables else STEPS_OF
+        for name, read in timed.items():
+            print(row(name, compare(Path(folder), ROOT, read, arguments.pairs)), flush=True)
 
 
 if __name__ == "__main__":

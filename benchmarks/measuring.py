@@ -20,8 +20,6 @@ COLUMNS = ("section", "env", "contestant", "repeat", "part", "steps", "seconds",
 COLUMNS += ("memory_mb", "note", "machine")
 
 ENVIRONMENTS = CARTPOLE, ACROBOT, HOPPER = "CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"
-MINIGRID = "MiniGrid-DoorKey-8x8-v0"
-VARIANTS = ("ppo", "mace_fixed", "mace_full")
 FIRST_SEED = 1000  # of the measurements; the study reports others
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 PACKAGES = "torch numpy numba gymnasium minigrid pybullet stable-baselines3"
@@ -35,31 +33,19 @@ class Scale:
     repeats: int
     steps: dict[str, int]  # of one training: multiples of 2048, whole rollouts of everybody
     peer_steps: dict[str, int]  # of stable-baselines3's, and of environments without an agent
-    growth_episodes: int
-    workflow_episodes: int  # of each run of the small workflow ...
-    workflow_seeds: int  # ... and how many of them, 3 environments × 3 variants
-    planned_seeds: int  # of the workflow that is only planned
 
 
 FULL = Scale(
     folder=ROOT / "benchmarks",
     repeats=5,
-    steps={CARTPOLE: 204800, ACROBOT: 204800, HOPPER: 65536, MINIGRID: 20480},
-    peer_steps={CARTPOLE: 30720, ACROBOT: 30720, HOPPER: 16384, MINIGRID: 20480},
-    growth_episodes=400,
-    workflow_episodes=200,
-    workflow_seeds=2,
-    planned_seeds=200,
+    steps={CARTPOLE: 204800, ACROBOT: 204800, HOPPER: 65536},
+    peer_steps={CARTPOLE: 30720, ACROBOT: 30720, HOPPER: 16384},
 )
 QUICK = Scale(
     folder=ROOT / "benchmarks" / "quick",
     repeats=1,
-    steps=dict.fromkeys([*ENVIRONMENTS, MINIGRID], 6144),
-    peer_steps=dict.fromkeys([*ENVIRONMENTS, MINIGRID], 2048),
-    growth_episodes=50,
-    workflow_episodes=5,
-    workflow_seeds=1,
-    planned_seeds=20,
+    steps=dict.fromkeys(ENVIRONMENTS, 6144),
+    peer_steps=dict.fromkeys(ENVIRONMENTS, 2048),
 )
 
 

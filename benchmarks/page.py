@@ -9,9 +9,8 @@ import pandas as pd
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from benchmarks import breakdown, minigrid, purejaxrl, speed, workflow
-from benchmarks.bounds import BOUNDS
-from benchmarks.measuring import ENVIRONMENTS, FILE, MINIGRID
+from benchmarks import breakdown, purejaxrl, speed
+from benchmarks.measuring import ENVIRONMENTS, FILE
 from mace_rl.base.files import write_atomically
 
 HEAD = """# Measurements
@@ -21,8 +20,7 @@ neither by hand. [docs/performance.md](../docs/performance.md) explains them.
 
 Rates and ratios are medians over the repeats, with their range in brackets. The line below each
 section's tables names its commit, which can be another one. An environment alone takes random
-actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs. The walks are random walks
-in the shape of Acrobot and Hopper that cost next to nothing.
+actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs.
 """
 RATE = "environment steps per CPU second"
 
@@ -83,68 +81,20 @@ def purejaxrl_section(rows: pd.DataFrame) -> str:
 
 
 def breakdown_section(rows: pd.DataFrame) -> str:
-    """µs per step: parts of the program by environment and contestant, and what bounds them."""
+    """µs per step: parts of the program by environment and contestant."""
     columns = [(environment, name) for environment in ENVIRONMENTS for name in speed.OURS]
     rows = rows.assign(time=1e6 * rows["seconds"] / rows["steps"])
     table = rows.pivot(index="part", columns=["env", "contestant"], values="time")[columns]
     table.columns = [" ".join(column) for column in columns]
-    bounds, table = table.reindex(BOUNDS), table.loc[breakdown.ALL_SECTIONS]
+    table = table.loc[breakdown.ALL_SECTIONS]
     table.loc["sum"] = table.sum()
-    bounds.loc["neither"] = table.loc["sum"] - bounds.sum()
-    shares = (bounds / table.loc["sum"]).map("{:.0%}".format)
-    return "\n\n".join(
-        [
-            markdown(table.map("{:.1f}".format).reset_index(names="µs per step"), table.columns),
-            "Of this: products and distances at the rate of a 64 × 64 product in the nearest "
-            "cache; what passes between that and the next, at the rate of reading 256 KB; and the "
-            "rest, such as tanh, Adam's roots, simulators and Python.",
-            markdown(bounds.map("{:.2f}".format).reset_index(names="µs per step"), table.columns),
-            markdown(shares.reset_index(names="share"), table.columns),
-        ]
-    )
-
-
-def growth_section(rows: pd.DataFrame) -> str:
-    """One row per walk: its last tenth beside its second."""
-    lines = []
-    for walk, run in rows.groupby("env", sort=False):
-        parts = run[["steps", "cpu_seconds"]].diff()
-        per_step = (1e6 * parts["cpu_seconds"] / parts["steps"]).tolist()
-        memory, steps = run["memory_mb"].tolist(), run["steps"].iloc[-1]
-        times = [f"{per_step[1]:.1f}", f"{per_step[-1]:.1f}", f"{per_step[-1] / per_step[1]:.2f}"]
-        lines.append([walk, f"{steps:,.0f}", *times, f"{memory[1]:.0f}", f"{memory[-1]:.0f}"])
-    columns = ["steps", "µs per step, second tenth", "last tenth", "ratio"]
-    columns += ["MB after the second tenth", "at the end"]
-    return markdown(pd.DataFrame(lines, columns=["environment", *columns]), columns)
-
-
-def minigrid_section(rows: pd.DataFrame) -> str:
-    """µs per step of everybody, and how many times the environment's alone within each repeat."""
-    step, lines = 1e6 / rates(rows)[MINIGRID], []
-    for contestant in minigrid.CONTESTANTS:
-        ratio = step[contestant] / step["environment"]
-        cells = [median_and_range(step[contestant], ".0f"), median_and_range(ratio, ".2f")]
-        lines.append([speed.LABELS[contestant], *cells])
-    columns = ["µs of CPU time per step", "÷ environment alone"]
-    return markdown(pd.DataFrame(lines, columns=[MINIGRID, *columns]), columns)
-
-
-def workflow_section(rows: pd.DataFrame) -> str:
-    """What the small workflow took, and the peak memory of its trainings."""
-    runs = rows["part"] == "training"
-    parts = rows[~runs].assign(seconds=rows["seconds"].map("{:.1f}".format))
-    parts = parts[["part", "seconds"]].set_axis([f"on {workflow.CORES} cores", "seconds"], axis=1)
-    peaks = rows[runs].pivot_table("memory_mb", "contestant", "env", aggfunc="max", sort=False)
-    return f"{markdown(parts, ['seconds'])}\n\n{by_environment('peak memory, MB', peaks, '.0f')}"
+    return markdown(table.map("{:.1f}".format).reset_index(names="µs per step"), table.columns)
 
 
 SECTIONS = {
     "speed": ("Speed", speed_section),
     "purejaxrl": ("Beside PureJaxRL", purejaxrl_section),
     "breakdown": ("Where a step's time goes", breakdown_section),
-    "growth": ("Growth over a long run of `mace_full`", growth_section),
-    "minigrid": ("MiniGrid", minigrid_section),
-    "workflow": ("The whole workflow", workflow_section),
 }
 
 

@@ -6,11 +6,9 @@ done so far. What happens before the first `next` is not timed.
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-import minigrid  # noqa: F401  (registers its environments)
 import numpy as np
 import pybullet_envs_gymnasium  # noqa: F401  (registers HopperBulletEnv-v0)
 
@@ -18,7 +16,6 @@ from benchmarks.measuring import (
     ENVIRONMENTS,
     FIRST_SEED,
     HOPPER,
-    MINIGRID,
     Scale,
     in_fresh_process,
     memory_mb,
@@ -40,7 +37,6 @@ LABELS = {
     "ppo": "our PPO, an update per episode (default)",
     "mace_full": "our mace_full",
 }
-WRAPPERS = {MINIGRID: ["minigrid.wrappers:ImgObsWrapper"]}  # by environment, the same for everybody
 # Steps of training before the clock starts: imports, compilation and the first updates are over.
 WARM_UP_STEPS = 20_480  # with 6,144 three kernels of the paper's network were still to be compiled
 PEER_WARM_UP_STEPS = 2048
@@ -111,7 +107,7 @@ def start(contestant: str, environment: str, seed: int, steps: int) -> Iterator[
     """Prepare `contestant` for at least `steps` steps in `environment`."""
     match contestant:
         case "environment":
-            return alone(wrapped(environment), seed, steps)
+            return alone(made(environment), seed, steps)
         case "environment_ours":
             from mace_rl.base.rng import Streams
             from mace_rl.environments.environment import Environment
@@ -134,20 +130,15 @@ def our_config(contestant: str, environment: str, seed: int) -> "RunConfig":
     """The study's settings of one of `OURS`, but without an end."""
     from mace_rl.library import settings
 
-    own: Any = {"environment_wrappers": WRAPPERS.get(environment, [])}
-    config = settings(environment, OURS[contestant], seed=seed, **own)
+    config = settings(environment, OURS[contestant], seed=seed)
     whole = {"rollout_steps": 2048, "minibatch_size": None} if contestant == "ppo_2048" else {}
     ppo = config.ppo.model_copy(update=whole)
     return config.model_copy(update={"ppo": ppo, "episodes": ENDLESS})
 
 
-def wrapped(environment: str) -> gymnasium.Env:
-    """The library's, in its `WRAPPERS`."""
-    env = gymnasium.make(environment, disable_env_checker=True)
-    for reference in WRAPPERS.get(environment, []):
-        module, _, name = reference.partition(":")
-        env = getattr(import_module(module), name)(env)
-    return env
+def made(environment: str) -> gymnasium.Env:
+    """The library's."""
+    return gymnasium.make(environment, disable_env_checker=True)
 
 
 def alone(env: gymnasium.Env, seed: int, steps: int) -> Iterator[int]:
@@ -174,7 +165,7 @@ def stable_baselines3(environment: str, seed: int, steps: int, **settings: int) 
     """stable-baselines3's PPO; `settings` are its own, all others its defaults."""
     from stable_baselines3 import PPO
 
-    model = PPO("MlpPolicy", wrapped(environment), seed=seed, device="cpu", **settings)
+    model = PPO("MlpPolicy", made(environment), seed=seed, device="cpu", **settings)
 
     def learn() -> Iterator[int]:
         model.learn(steps)

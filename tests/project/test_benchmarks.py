@@ -1,4 +1,4 @@
-"""benchmarks/: where time goes, what the work is, the page, the guard, PureJaxRL."""
+"""benchmarks/: where time goes, the page, the guard, PureJaxRL."""
 
 import importlib
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from shared import ROOT
 
-from benchmarks import bounds, breakdown, guard, page, purejaxrl
+from benchmarks import breakdown, guard, page, purejaxrl
 from benchmarks.measuring import CARTPOLE, FILE, HOPPER
 
 
@@ -32,34 +32,6 @@ def test_profile_changes_nothing_and_misses_nothing(run_config, monkeypatch, env
     assert profiled.records == plain.records
     expected = breakdown.SECTIONS | (breakdown.BONUS if variant == "mace_full" else {})
     assert watch.stop().keys() == expected.keys()
-
-
-def test_work_is_that_of_a_training_which_it_leaves_alone(run_config, monkeypatch):
-    """One update an episode: four epochs of both networks, which see four numbers."""
-    from mace_rl.training.trainer import Trainer
-
-    owners = ("update_policy", "update_critic", "policy_gradients")
-    for owner, name in (
-        *((bounds.compiled_learner, name) for name in owners),
-        *((bounds.CompiledMLP, name) for name in ("forward", "outputs", "backward")),
-        (bounds.Neighbours, "nearest"),
-    ):  # put back after the test
-        monkeypatch.setattr(owner, name, getattr(owner, name))
-    config = run_config("CartPole-v1", "ppo", episodes=3)
-    plain, counted, work = Trainer(config), Trainer(config), bounds.Work()
-    assert len(list(plain.run())) == 3
-    work.watch(counted)
-    assert len(list(counted.run())) == 3
-    assert counted.records == plain.records
-    steps = plain.records[-1].env_steps
-    weights = 4 * 64 + 64 * 64 + 64 * 16  # in products: outputs are filled up to 16
-    inward = 2 * 64 * 64 + 64 * 2 + 64 * 1  # gradients of the hidden layers, of two logits, a value
-    acting_and_values = steps + steps + 3  # the critic sees an episode's last state, too
-    narrow = 2 * 16 - 2 - 1  # columns that the gradient of the last weights does not fill up
-    each = 4 * weights + inward - 64 * narrow  # of both networks: forward, gradients of weights
-    expected = 2 * (weights * acting_and_values + 4 * steps * each)
-    assert work.operations == expected
-    assert work.bytes > 0
 
 
 def test_purejaxrl_s_training_imports_nothing_but_what_its_environment_has():
@@ -90,35 +62,35 @@ def test_the_page_of_measurements_is_what_they_say(tmp_path):
     assert page.write(tmp_path).read_text() == (kept / "README.md").read_text()
 
 
-def test_the_guard_s_ratios_are_of_pairs(monkeypatch):
+def test_the_guard_s_ratios_are_of_pairs():
     now, before = Path("now"), Path("before")
     slower = {1000: 1.1, 1001: 1.3, 1002: 0.9}  # by seed, which each pair has of its own
     slower[1003] = 9.0  # of the reading that compiles
 
-    def read(tree, who, env, seed, steps):
+    def read(tree, seed):
         asked.append((tree, seed))
         return 10.0 * (seed - 999) * (slower[seed] if tree == now else 1.0)
 
     asked = []
-    monkeypatch.setattr(guard, "microseconds", read)
-    found = guard.compare(before, now, CARTPOLE, "ppo", 3, 99)
+    found = guard.compare(before, now, read, 3)
     assert asked[:4] == [(before, 1003), (now, 1003), (before, 1000), (now, 1000)]
     assert asked[4:6] == [(now, 1001), (before, 1001)]
-    assert guard.row(CARTPOLE, "ppo", found) == (
-        "| CartPole-v1 `ppo` | 20.0 | 26.0 | 1.10 (0.90 to 1.30) |"
+    assert guard.row("`ppo`", found) == "| `ppo` | 20.0 | 26.0 | 1.10 (0.90 to 1.30) |"
+
+
+def test_the_guard_times_the_tables_of_a_tree(tmp_path):
+    """Of one whose tables cost next to nothing, and of one that has none."""
+    module = tmp_path / "tools" / "tables.py"
+    module.parent.mkdir()
+    (tmp_path / "tools" / "tables.py").write_text(
+        "sum(range(10**7)); print('2 tables and figures of')"
     )
-
-
-def test_the_guard_counts_between_two_numbers_of_steps(monkeypatch):
-    def run_in(tree, command, **more):
-        steps = int(command[-1]) + 3  # whole episodes
-        count = f"==7== I   refs:      {10**9 + 1234 * steps:,}" * (command[0] == "valgrind")
-        return subprocess.CompletedProcess(command, 0, f"{steps}\n", count)
-
-    monkeypatch.setattr(guard, "run_in", run_in)
-    assert guard.instructions(ROOT, "ppo", CARTPOLE) == 1234
+    assert 0.05 < guard.tables(tmp_path, 0) < 60
+    module.write_text("raise SystemExit('nothing is kept')")
+    with pytest.raises(SystemExit, match=r"tools\.tables ended with nothing is kept"):
+        guard.tables(tmp_path, 0)
 
 
 @pytest.mark.slow
 def test_the_guard_reads_a_training_of_a_tree():
-    assert 1 < guard.microseconds(ROOT, "ppo", CARTPOLE, 1000, 2048) < 10_000
+    assert 1 < guard.microseconds("ppo", CARTPOLE, 2048, ROOT, 1000) < 10_000

@@ -100,7 +100,8 @@ def first_in(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     won: dict[str, np.ndarray] = {}
     for name, rows in spread.items():
         others = [other for key, other in spread.items() if key != name]
-        won[name] = np.sum(rows < reduce(np.minimum, others), axis=0, dtype=np.uint8)
+        lowest = rows < reduce(np.minimum, others)
+        won[name] = np.asarray(np.sum(lowest, axis=0, dtype=np.uint8))
     return won
 
 
