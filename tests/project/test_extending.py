@@ -13,7 +13,6 @@ import pytest
 from invented import table_for_tables
 from shared import ROOT, call, refusal
 
-from mace_rl.library import settings
 from mace_rl.runs.agent import load_agent
 from mace_rl.runs.finished import FinishedRun
 from mace_study.compare.claims_config import read_claims
@@ -63,8 +62,7 @@ def test_every_example_is_one_file_and_one_entry():
     assert {Path(name).suffix for name in FILES} == {".py", ".yaml"}
     assert all(f"{Path(name).stem}.yaml" in FILES for name in FILES)
     assert len(FILES["other_claims.yaml"].splitlines()) <= 24
-    folders = {"layer_norm", "grid_counts", "linear_decay", "chain", "growing_chain"}
-    assert set(TRAININGS) == folders
+    assert set(TRAININGS) == {"layer_norm", "grid_counts", "linear_decay", "chain"}
 
 
 @pytest.mark.parametrize("name", TRAININGS)
@@ -84,15 +82,6 @@ def test_example_trains(folder, train, name):
             np.testing.assert_allclose(episodes["beta"], expected)
         case "chain":
             assert (episodes["length"] <= 50).all() and episodes["extrinsic_return"].max() == 1
-        case "growing_chain":  # from a place 2 of 4, one step is enough the first time only
-            assert episodes["extrinsic_return"].sum() >= 2
-
-
-def test_the_example_s_state_is_saved(folder, kill, checkpoint_every, completes):
-    config = settings("growing_chain:GrowingChain-v0", "ppo", config="growing_chain.yaml")
-    checkpoint_every(1)
-    kill(15, config, folder / "killed")
-    assert completes(config, folder / "killed")["interruptions"][0]["environment_replayed"]
 
 
 def test_example_metric(folder):

@@ -3,6 +3,7 @@
 import re
 import shutil
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 from shared import ROOT, call, refusal
 from tensorboardX.proto.event_pb2 import Event
 
+from mace_rl import load_agent
 from mace_rl.base import files
 from mace_rl.runs import checkpoint
 from mace_rl.training.trainer import Trainer
@@ -176,3 +178,20 @@ def test_a_checkpoint_that_no_training_wrote(trainer, monkeypatch, tmp_path):
 def test_without_the_package_one_line_says_so(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     assert "pip install tensorboardX" in refusal(monkeypatch, "tensorboard", str(run))
+
+
+@pytest.mark.slow
+def test_a_policy_leaves_for_plain_pytorch_as_the_page_says(trained, tmp_path, monkeypatch):
+    shutil.copytree(trained("CartPole-v1", "ppo", 0, episodes=10), tmp_path / "cartpole_run")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    exec(re.findall(r"```py\n(.*?)```", page, re.DOTALL)[0], {})
+    rows, agent = torch.randn(5, 4), load_agent("cartpole_run")
+    torch.save(rows, "rows.pt")
+    alone = "import sys; sys.modules['mace_rl'] = None\nimport torch\n"
+    alone += "policy = torch.export.load('policy.pt2').module()\n"
+    alone += "torch.save(policy(torch.load('rows.pt')), 'logits.pt')"
+    subprocess.run([sys.executable, "-c", alone], check=True)
+    logits = torch.load("logits.pt")
+    assert torch.equal(logits, agent.outputs(rows))
+    assert torch.equal(logits - logits.logsumexp(-1, keepdim=True), agent.policy(rows).logits)

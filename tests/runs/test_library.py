@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -232,3 +233,22 @@ def test_without_a_folder_for_caches_a_temporary_one_serves(tmp_path, monkeypatc
     compiling.spare_folder.cache_clear()
     with pytest.raises(Refusal, match="is not this user's alone: let NUMBA_CACHE_DIR name"):
         compiling.spare_folder()
+
+
+def test_compiled_code_need_not_be_kept(monkeypatch, tmp_path, caplog):
+    """As on a full disk, here by a limit on what a file may hold."""
+    monkeypatch.setattr(compiling, "FOLDER", tmp_path / "numba" / "x")
+    compiling.warn_unkept.cache_clear()
+
+    def one_more(x):
+        return x + 1
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    compiled = compiling.njit(cache=True)(one_more)
+    assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        assert compiled(1) == 2 and compiled(1.5) == 2.5
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [str(tmp_path / "numba") in message for message in caplog.messages] == [True]

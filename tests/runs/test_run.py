@@ -37,7 +37,7 @@ from shared import (
 )
 
 from mace_rl.base import code_digest
-from mace_rl.base.files import LOCK
+from mace_rl.base.files import CHECKPOINT, LOCK, RECORD
 from mace_rl.base.tables import RecordError
 from mace_rl.config.section import ConfigError
 from mace_rl.environments import hopper
@@ -398,3 +398,21 @@ def test_what_cannot_go_on_is_refused_with_the_reason(run_config, tmp_path):
         with refused(ConfigError, rf"{folder} holds a finished run where .*{re.escape(why)}"):
             run_to(episodes, folder, **changes)
     assert before == {folder: content_of(tmp_path / folder) for folder in before}
+
+
+@pytest.mark.parametrize("name", [RECORD, CHECKPOINT, "episodes.csv", "progress.json", LOCK])
+def test_a_pipe_in_a_run_s_place_is_refused(run_config, tmp_path, name):
+    config = run_config("CartPole-v1", "ppo", 0, episodes=2)
+    if name == "episodes.csv":
+        run.run(config, tmp_path)
+        (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    with pytest.raises((run.RunError, OSError, ValueError), match=name):
+        run.run(config, tmp_path)
+
+
+def test_an_unfinished_run_that_left_nothing_starts_over_in_words(run_config, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    (tmp_path / LOCK).write_bytes(run.CLAIM)
+    run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path)
+    assert f"starting over: what was trained in {tmp_path} left no checkpoint" in caplog.text

@@ -20,6 +20,7 @@ from invented import (
     ROBUST,
     ROOT,
     STUDY,
+    VARIANTS,
     table_for_claims,
     table_for_questions,
 )
@@ -30,7 +31,9 @@ from mace_rl.config.section import ConfigError
 from mace_study.compare import verdicts
 from mace_study.compare.claims_config import parts_of, read_claims
 from mace_study.compare.ledger import Finding, read_ledger, to_json
+from mace_study.compare.verdicts import ledger
 from mace_study.measure.betas import BEFORE
+from mace_study.show.sections import of_ledger
 
 EQUAL = dict.fromkeys(("ppo", "mace_fixed", "mace_full"), 0.0)
 SMALL = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.1}
@@ -324,3 +327,12 @@ def test_what_a_study_lacks_for_a_family() -> None:
         bare = QUESTIONED.model_copy(update={"reference_return": {}})
         (first, *_) = CLAIMS.lacking(whole, bare)[title]
         assert first.startswith(("sample_efficiency_common", "metrics.reference_return."))
+
+
+def test_too_few_seeds_are_named_where_claims_are_judged():
+    equal = dict.fromkeys(VARIANTS, 0.0)
+    said = "No claim can have a verdict: that takes 10 seeds, and there are 9."
+    for seeds, expected in ((9, True), (10, False)):
+        answers = ledger(table_for_claims(seeds, equal, 0.1), QUICK, PAPERS)
+        notes = [one.note for one in of_ledger(answers, PAPERS) if one.level == 2]
+        assert notes and all((said in note) == expected for note in notes)

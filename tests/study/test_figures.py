@@ -11,6 +11,7 @@ import scipy.stats
 from invented import (
     CLAIMS,
     QUESTIONED,
+    QUICK,
     SEEDS,
     STUDY,
     table_for_claims,
@@ -268,3 +269,23 @@ def test_every_picture_is_the_same_again(runs, ledgers, settings, tmp_path, name
         c.save_figure(figure, tmp_path / path)
     assert not illegible(figure)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_an_inset_never_lies_on_a_curve():
+    early = np.concatenate([np.arange(20), np.full(180, 19.0)])
+    low = np.where(np.arange(200) < 25, early, 8.0)  # it comes down to where the inset would be
+    curves = [
+        pd.DataFrame({"env": "E", "variant": variant, "episode": np.arange(1, 201), "n": 1}).assign(
+            mean=mean, lower=np.nan, upper=np.nan
+        )
+        for variant, mean in (("a", early), ("b", early), ("c", low))
+    ]
+    shown, found = c.quantity("1", QUICK), []
+    for own in (curves[:2], curves):
+        seeds = pd.concat(own).rename(columns={"mean": shown.name}).assign(seed=0)
+        names = {name: name for name in "abc"}
+        colours = dict(zip("abc", ("red", "green", "blue"), strict=True))
+        look = c.PlotStyle(FigureConfig(columns=1, inset=0.1), 0.95, names, colours, {})
+        [panel] = c.draw_figure(pd.concat(own), seeds, shown, look).axes[:1]
+        found.append(len(panel.child_axes))
+    assert found == [1, 0]

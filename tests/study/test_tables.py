@@ -34,12 +34,14 @@ from mace_study.compare.aggregate import aggregate
 from mace_study.compare.comparisons import comparisons
 from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import MetricsConfig
+from mace_study.measure.betas import BEFORE, CORRELATION
+from mace_study.measure.betas import LABELS as TITLES
 from mace_study.measure.metrics import Metric, all_metrics, metrics_columns
 from mace_study.show import tables
 from mace_study.show.latex import latex_cell, table1_latex, table2_latex
 from mace_study.show.markdown import markdown, plain
 from mace_study.show.markdown import page as markdown_page
-from mace_study.show.sections import of_ledger, of_runs, read_data
+from mace_study.show.sections import _others, of_ledger, of_runs, read_data
 from mace_study.show.tables import Cell, Value, estimate, number
 
 metrics = partial(table_for_tables, all_metrics(QUICK))
@@ -294,3 +296,40 @@ def test_the_page_of_a_study_has_each_of_its_tables_with_the_numbers_of_their_fi
     alone |= {"metrics": runs.iloc[:10], "betas": data["betas"].iloc[:0]}
     page = markdown_page("", "", of_runs(alone, CLAIMS, QUICK))
     assert not re.search("who is better|claims|environments together|## β|!\\[|nan", page)
+
+
+def test_every_column_of_a_table_has_the_label_of_what_is_in_it():
+    """Each number is unlike all others, so that a cell tells the column that it is from."""
+    values = dict(zip(TITLES, (0.1, 0.2, 0.3, 0.4, 0.5), strict=True))
+    rows = [
+        {"env": "E", "variant": "v", "seed": seed, "beta_highest": 0.9 + seed / 100} | values
+        for seed in range(10)
+    ]
+    frame = tables.betas(pd.DataFrame(rows), QUICK)
+    for name, value in values.items():
+        cell = frame[TITLES[name]].iloc[0]
+        text = cell if isinstance(cell, str) else cell.values[0].text
+        assert float(text.split(",")[0]) == value
+    compared = {"difference": 11.0, "low": 12.0, "high": 13.0, "p_value": 0.14, "p_holm": 0.15}
+    compared |= {"probability": 0.16, "probability_low": 0.17, "probability_high": 0.18}
+    what = {"env": "E", "metric": "final_return", "variant": "v", "baseline": "w", "seeds": 19}
+    means = pd.DataFrame([{**what, "mean": 11.0, "low": 12.0, "high": 13.0}])
+    shown = tables.comparisons(pd.DataFrame([what | compared]), means, QUICK).iloc[0]
+    heads = {"n": "seeds", "difference": "difference", "p": "p_value", "p (Holm)": "p_holm"}
+    for head, name in (heads | {"P": "probability"}).items():
+        assert float(shown[head].values[0].text) == pytest.approx((what | compared)[name])
+    mean = {"mean": 0.21, "mean_low": 0.2, "mean_high": 0.3, "iqm": 0.22, "iqm_low": 0.1}
+    one = {"variant": "v", "metric": "m", "runs": 23, **mean, "iqm_high": 0.4}
+    shown = tables.aggregate(pd.DataFrame([one])).iloc[0]
+    for head, name in {"runs": "runs", "mean": "mean", "interquartile mean": "iqm"}.items():
+        assert float(shown[head].values[0].text) == pytest.approx(one[name])
+
+
+def test_the_page_names_the_column_that_a_claim_is_judged_by():
+    for name, title in ((CORRELATION, TITLES[CORRELATION]), (BEFORE, TITLES[BEFORE])):
+        rows = [{"env": "E", "variant": "v", "seed": seed} for seed in range(10)]
+        betas = pd.DataFrame(rows).assign(**dict.fromkeys([*TITLES, "beta_highest"], 0.5))
+        betas["beta_end"] = betas["seed"] / 10
+        asked = [("C9", name)]
+        [beta] = _others({"metrics": betas, "betas": betas}, QUICK, asked)
+        assert TITLES[name] == title and f"Of C9 it is the column *{title}*" in beta.note
