@@ -150,13 +150,13 @@ def headless(inputs, outputs, hidden_units):
 )
 def test_modules_that_do_not_fit_are_refused_by_name(run_config, module, arguments, problem):
     own = LAYER_NORM | {"module": f"test_network:{module}", "arguments": arguments}
-    config = run_config(ppo={"network": own}).ppo
+    config = run_config(engine="torch", ppo={"network": own}).ppo
     with pytest.raises(ConfigError, match=rf"ppo\.network\.module.*{module}.*{problem}"):
         custom_module(config.network, config.hidden_units, 40, 3, np.random.default_rng(0))
 
 
 def test_a_module_of_one_s_own_is_the_same_from_the_same_seed_and_disturbs_nothing(run_config):
-    config = run_config(ppo={"network": LAYER_NORM}).ppo
+    config = run_config(engine="torch", ppo={"network": LAYER_NORM}).ppo
     before = torch.get_rng_state()
     generators = map(np.random.default_rng, (0, 0, 1))
     modules = [custom_module(config.network, [16], 5, 3, generator) for generator in generators]

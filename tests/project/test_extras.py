@@ -191,6 +191,7 @@ def test_a_variant_s_bonus_goes_over_that_of_training(tmp_path):
         "  third: {beta: {kind: constant, value: 1.0}, bonus: {estimator: 'test_extras:Fixed2'}}\n"
         "  back: {beta: {kind: none}, ppo: {network: {kind: mlp}}}\n"
         "training:\n"
+        "  engine: torch\n"
         "  bonus: {kind: custom, estimator: 'test_extras:Fixed', arguments: {b: 7}}\n"
         "  ppo: {network: {kind: torch, module: 'torch.nn:Linear'}}\n"
     )

@@ -34,7 +34,7 @@ from mace_rl.training.trainer import Trainer
         ("CartPole-v1", {}),
         ("Pendulum-v1", {}),
         ("FrozenLake-v1", {"engine": "torch"}),
-        ("Pendulum-v1", {"ppo": {"network": LAYER_NORM}}),
+        ("Pendulum-v1", {"engine": "torch", "ppo": {"network": LAYER_NORM}}),
     ],
 )
 def test_agent_is_torch_modules_that_act_as_trained(run_config, trained, environment, changes):

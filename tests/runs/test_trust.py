@@ -32,7 +32,10 @@ HOSTILE = {  # by the key that is named
     "beta.rule": {"beta": PAGER},
     "bonus.estimator": {"bonus": OWN},
     "novelty.estimator": {"novelty": OWN},
-    "ppo.network.module": {"ppo": {"network": {"kind": "torch", "module": "evil:Own"}}},
+    "ppo.network.module": {
+        "engine": "torch",
+        "ppo": {"network": {"kind": "torch", "module": "evil:Own"}},
+    },
     "environment": {"environment": "evil:CartPole-v1"},
     "environment_arguments.a.b": {"environment_arguments": {"a": [1, {"b": ["evil:Own"]}]}},
     "environment_arguments.c": {"environment_arguments": {"c": {"evil:Own": 1}}},
@@ -75,7 +78,7 @@ def test_a_run_runs_only_this_package_s_code(kept, monkeypatch, tmp_path, key):
 def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkeypatch, tmp_path):
     play = ["evaluate", "watch"]
     for key, settings, commands in (
-        ("ppo.network.module", {"ppo": {"network": NETWORK}}, [*play, "verify"]),
+        ("ppo.network.module", {"engine": "torch", "ppo": {"network": NETWORK}}, [*play, "verify"]),
         ("beta.rule", {"beta": PAGER}, ["verify"]),  # which playing does not need
     ):
         run = kept(**settings)
@@ -83,7 +86,9 @@ def test_with_leave_a_run_s_code_runs_if_it_is_of_its_kind(kept, trained, monkey
             code, said = call(monkeypatch, command, str(run), "--trust")
             assert code == 1 and f"{key} has 'pydoc:pipepager', but it should name" in said
     assert not (tmp_path / "ran").exists()
-    folder = str(trained("CartPole-v1", "ppo", episodes=2, ppo={"network": LAYER_NORM}))
+    folder = str(
+        trained("CartPole-v1", "ppo", episodes=2, engine="torch", ppo={"network": LAYER_NORM})
+    )
     for command in play:
         assert call(monkeypatch, command, folder, "--trust") == (0, "")
 

@@ -70,6 +70,7 @@ training: {novelty: {kind: custom}}  # training, novelty, estimator, kind
 training: null  # training, None, dictionary
 training: {environment: CartPole-v1}  # training.environment, 'CartPole-v1', environments
 training: {ppo: {network: {kind: torch}}}  # ppo.network, module, missing
+training: {ppo: {network: {kind: torch, module: 'a:B'}}}  # engine, 'compiled', "torch"
 training: {ppo: {network: {kind: torch, module: net}}}  # module, 'net', package.module:Name
 metrics: {custom: [no_such:metric]}  # metrics.custom, 'no_such:metric'
 environments: [no_such:Walk-v0]  # environment, 'no_such:Walk-v0', no_such

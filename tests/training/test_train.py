@@ -27,7 +27,7 @@ SETTINGS = {
     "an episode": {},
     "several": {"ppo": SEVERAL},
     "torch": {"engine": "torch", "ppo": SEVERAL},
-    "a network of one's own": {"ppo": {"network": LAYER_NORM}},
+    "a network of one's own": {"engine": "torch", "ppo": {"network": LAYER_NORM}},
 }
 OBJECTIVES = ("score", "progress", "return", "centred", "words", "credit_network")  # of β
 
@@ -384,13 +384,16 @@ def test_any_environment_trains(run_config, environment, variant, changes):
 
 
 @pytest.mark.parametrize(
-    ("variant", "network"),
-    [*((variant, {"kind": "mlp"}) for variant in VARIANTS), ("ppo", LAYER_NORM)],
+    ("variant", "engine", "network"),
+    [
+        *((variant, "compiled", {"kind": "mlp"}) for variant in VARIANTS),
+        ("ppo", "torch", LAYER_NORM),
+    ],
 )
-def test_it_learns_what_pays(run_config, register, variant, network):
+def test_it_learns_what_pays(run_config, register, variant, engine, network):
     name = register("Bonanza-v0", Bonanza, 5)
     settings = {"actor_learning_rate": 0.01, "rollout_steps": 50, "network": network}
     settings["centre_advantages"] = True  # its states do not tell how many steps are left
-    config = run_config(name, variant, 0, episodes=200, ppo=settings)
+    config = run_config(name, variant, 0, episodes=200, engine=engine, ppo=settings)
     returns = [record.extrinsic_return for record in finish(config).records]
     assert np.mean(returns[:10]) < 3.5 and np.mean(returns[-50:]) > 4.5

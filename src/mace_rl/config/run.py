@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PositiveInt, model_validator
 
-from mace_rl.config.agent import PPOConfig
+from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_rl.config.beta import BetaConfig, MetaBeta, MetaConfig
 from mace_rl.config.bonus import BonusConfig, MemoryConfig, NoveltyConfig
 from mace_rl.config.plugins import call_of
@@ -80,10 +80,18 @@ class AgentConfig(Section):
     environment_wrappers: list[Annotated[WrapperConfig, BeforeValidator(_by_name)]] | None = None
     # None: `mace_rl.training.trainer`; else `mace_rl.published`.
     trainer: Literal["published"] | None = None
-    engine: Literal["compiled", "torch"] = "compiled"  # of policy and critics
+    engine: Literal["compiled", "torch"] = "compiled"  # what networks are computed by
     ppo: PPOConfig
     published: PublishedConfig | None = None
     bonus: BonusConfig | None = Field(default=None, discriminator="kind")
+
+    @model_validator(mode="after")
+    def _compiled_code_has_no_modules(self) -> "AgentConfig":
+        if self.engine == "compiled" and isinstance(self.ppo.network, TorchModule):
+            raise ValueError(
+                "engine is 'compiled', but should be \"torch\" with ppo.network.kind torch"
+            )
+        return self
 
     @property
     def wrappers(self) -> list[tuple[str, dict[str, Any]]]:

@@ -134,7 +134,7 @@ def may_use_torch(config: RunConfig) -> bool:
     entry_point = getattr(spec_of(config.environment), "entry_point", None)
     places = [entry_point, *config.references().values()]
     ours = all(isinstance(place, str) and place.startswith(WITHOUT_TORCH) for place in places)
-    return not ours or config.engine == "torch" or config.trainer == "published"
+    return not ours or config.engine == "torch"
 
 
 def trainer_of(config: RunConfig) -> Trainer:

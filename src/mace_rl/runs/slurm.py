@@ -20,7 +20,7 @@ ENTRY_MINUTES = 120
 def minutes(config: RunConfig, work: float) -> int:
     """The time to ask for; work: the run's environment steps, in units of plain PPO's."""
     ours = IN_COMPILED_CODE.get(config.environment, STEPS_PER_SECOND)
-    speed = IN_TORCH if "torch" in (config.engine, config.ppo.network.kind) else ours
+    speed = IN_TORCH if config.engine == "torch" else ours
     return math.ceil((START_SECONDS + work / speed) / 60)
 
 

@@ -147,13 +147,12 @@ def actor_critic(
     """The untrained policy and critics, one for each kind of reward."""
     settings, size = config.ppo, spaces.observation_size
     learner: type[Learner] = CompiledLearner
-    in_torch = config.engine == "torch" or isinstance(settings.network, TorchModule)
-    if in_torch:
+    if config.engine == "torch":
         from mace_rl.agent.torch_learner import TorchLearner as learner
 
     def network(outputs: int, output_gain: float, stream: str) -> Network:
         sizes, generator = [size, *settings.hidden_units, outputs], streams[stream]
-        if in_torch:
+        if config.engine == "torch":
             return torch_network(settings, sizes, output_gain, generator)
         return CompiledMLP(mlp(sizes, output_gain, generator))
 
