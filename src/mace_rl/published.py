@@ -88,7 +88,7 @@ class Critic(Actor):
         return self.head(self.attention(features, features, features)[0][:, 0])
 
 
-class MetaNetwork(nn.Module):
+class PublishedMetaNetwork(nn.Module):
     """An episode's steps, [1, T, inputs] → [1, 1], of which β is the logistic function."""
 
     def __init__(self, inputs: int, dropout: bool, units: int = 128) -> None:
@@ -111,7 +111,7 @@ class MetaNetwork(nn.Module):
         return self.end((seen * seen.mean(-1).softmax(1)[..., None]).sum(1))
 
 
-class Curiosity(Stateful):
+class PublishedCuriosity(Stateful):
     """The bonus of each step, for the state before it, and the raw states that it rests on."""
 
     STATE = ("keys", "usage", "size", "buffer", "entered")
@@ -193,7 +193,7 @@ class Curiosity(Stateful):
         self.visits = {one.tobytes(): n for one, n in zip(visited, counts, strict=True)}
 
 
-class Meta(Stateful):
+class PublishedMeta(Stateful):
     """The meta network and the β that it printed last, which usually reaches nothing."""
 
     STATE = ("printed", "draws")
@@ -201,7 +201,7 @@ class Meta(Stateful):
     def __init__(self, spaces: Spaces, dropout: bool, draws: np.random.Generator) -> None:
         self.printed, self.draws, self.actions = 0.0, draws, spaces.actions.width
         with drawing_from(draws):
-            self.network = MetaNetwork(spaces.observation_size + self.actions + 2, dropout)
+            self.network = PublishedMetaNetwork(spaces.observation_size + self.actions + 2, dropout)
 
     def read(self, episode: Episode, bonus: np.ndarray) -> None:
         """An episode and, or zeros in its place, its bonus, [T]."""
@@ -225,7 +225,7 @@ def networks(config: AgentConfig, spaces: Spaces, streams: Streams) -> ActorCrit
     return ActorCritic(settings, policy, critics, RunningNormaliser(size), TorchLearner)
 
 
-class PPO(ActorCritic, Stateful):
+class PublishedPPO(ActorCritic, Stateful):
     """One update per episode, on all of it: like nikhilbarhate99/PPO-PyTorch's up to d5c8837."""
 
     STATE = ("actor", "critic", "optimiser", "draws")
@@ -283,10 +283,10 @@ class PublishedTrainer(Trainer):
             reason = f"{config.beta.objective.kind!r}, which trainer: published does not know"
             raise ConfigError(f"beta.objective is {reason}")
         self.settings, bonus = config.published, config.beta.kind != "none"
-        self.curiosity = Curiosity(config.published, environment) if bonus else None
+        self.curiosity = PublishedCuriosity(config.published, environment) if bonus else None
         dropout = config.published.dropout
-        self.controller = Meta(environment, dropout, streams["meta"]) if bonus else None
-        self.ppo = PPO(networks(config, environment, streams), streams["dropout"])
+        self.controller = PublishedMeta(environment, dropout, streams["meta"]) if bonus else None
+        self.ppo = PublishedPPO(networks(config, environment, streams), streams["dropout"])
         self.play = self._play
 
     def _play(self, environment: Environment, policy: Any, noise: np.ndarray) -> Episode:

@@ -87,7 +87,7 @@ def test_an_update_is_the_plain_formula(environment):
 def test_the_bonus_of_ten_steps_by_hand(monkeypatch):
     monkeypatch.setattr(published, "CAPACITY", 3)
     spaces = SimpleNamespace(observation_size=1, action_space=gymnasium.spaces.Discrete(2))
-    curiosity = published.Curiosity(PublishedConfig(), spaces)
+    curiosity = published.PublishedCuriosity(PublishedConfig(), spaces)
     states = np.array([[0], [1], [3], [0], [3.25], [7], [7], [1], [0.5], [5], [0]], np.float32)
     rewards = np.array([1, 1, -2, 0, 1, -1, 1, 1, 1, 0.0])
     actions, log_probs = np.zeros(10, np.int64), np.zeros(10, np.float32)
