@@ -5,20 +5,22 @@ A part of `make tables`. Only a reading all of whose runs are kept is asked.
 
 import json
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
 from mace_study.compare import ceiling
+from mace_study.compare.claims_config import parse_claims
 from mace_study.compare.comparisons import ALL, comparisons
-from mace_study.compare.specification import MOVES, asked_beta, specification
+from mace_study.compare.specification import MOVES, alone, asked_beta, in_tasks, specification
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
 from mace_study.measure.betas import betas_table
@@ -30,6 +32,7 @@ from mace_study.show.sections import Section
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / "config.yaml"
 # By world the folder that its runs are in, and the seeds of each environment.
 WORLDS = {
     "tuned": ("tuned", dict.fromkeys(("Acrobot-v1", "CartPole-v1"), range(200, 240))),
@@ -39,12 +42,26 @@ WORLDS = {
 CEILING = ROOT / "reference" / "measured" / "ceiling.csv"
 CONTROLS = [ROOT / "config" / "tasks.yaml", ROOT / "config" / "planted.yaml"]
 BASELINES = ("ppo", "mace_fixed")
+# By claim of ours the files of its study over config.yaml, the last also the runs' folder; seeds.
+TASKS = {"P1": (["tasks"], range(200, 220)), "G2": (["tasks", "minigrid"], range(700, 720))}
+PLANTED, HELD_OUT = ("PlantedHelp-v0", "PlantedHarm-v0"), range(320, 340)
 DEFAULT = "mace_full"
 READINGS = (
     *(DEFAULT, "mace_score", "mace_progress", "mace_return", "mace_centred", "mace_words"),
     *("mace_credit_network", "mace_evidence"),
 )
 DECIDES = "robust"
+
+
+def end_of_beta(run: kept_runs.Kept) -> float:
+    """The mean β that the network asks for in the last tenth of a run."""
+    asked = asked_beta(run.episodes["beta"].to_numpy(), config_of(run))
+    return float(asked[-(len(asked) // 10) :].mean())
+
+
+def config_of(run: kept_runs.Kept) -> RunConfig:
+    """The settings of a run."""
+    return RunConfig.model_validate(json.loads(run.record)["config"])
 
 
 class Measured(NamedTuple):
@@ -62,39 +79,73 @@ def measured(path: Path, variant: str, seeds: range, settings: MetricsConfig) ->
         return None
     frames, moved, first = {}, [], {}
     for seed in seeds:
-        record, frame = there[variant, seed]
-        config = RunConfig.model_validate(json.loads(record)["config"])
+        frame, config = there[variant, seed].episodes, config_of(there[variant, seed])
         frames[config.environment, variant, seed] = frame
         first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
-        if variant not in BASELINES:
+        if variant in READINGS:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     both = metrics_table(frames, settings), betas_table(frames, settings)
     return Measured(both[0].merge(both[1], on=["env", "variant", "seed"]), moved, first)
 
 
 def asked(
-    folder: Path, seeds: Mapping[str, range], settings: MetricsConfig, cores: int
+    folder: Path,
+    seeds: Mapping[str, range],
+    settings: MetricsConfig,
+    cores: int,
+    baselines: Sequence[str],
 ) -> dict[tuple[str, str], Measured]:
-    """By environment and variant the runs of one world, of those that are complete there."""
-    jobs = [(env, name) for name in (*BASELINES, *READINGS) for env in seeds]
+    """By environment and variant the runs of baselines and of the readings that have them all."""
+    jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
     paths = [folder / f"{files.folder_of(env)}.parquet" for env, _ in jobs]
     ranges, variants = zip(*((seeds[env], name) for env, name in jobs), strict=True)
     with ProcessPoolExecutor(cores) as pool:
         made = pool.map(measured, paths, variants, ranges, repeat(settings))
         found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
     whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
-    if lacking := [name for name in BASELINES if name not in whole]:
+    if lacking := [name for name in baselines if name not in whole]:
         raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
     return {job: runs for job, runs in found.items() if job[1] in whole}
 
 
+def in_our_tasks(kept: Path, cores: int) -> pd.DataFrame:
+    """`in_tasks` of `TASKS`."""
+    found = []
+    for claim, (layers, seeds) in TASKS.items():
+        study = read_study([CONFIG, *(ROOT / "config" / f"{layer}.yaml" for layer in layers)])
+        path = ROOT / study.claims
+        [family] = alone(parse_claims(path), claim).families.values()
+        [part] = family.claims[claim].parts[DECIDES]
+        each = dict.fromkeys(part.environments, seeds)
+        runs = asked(kept / layers[-1], each, study.metrics, cores, part.over)
+        table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
+        readings = [name for name in READINGS if name in set(table["variant"])]
+        found.append(in_tasks(table, study.metrics, path, readings, claim, DECIDES))
+    return pd.concat(found, ignore_index=True)
+
+
+def in_planted(kept: Path) -> pd.DataFrame:
+    """Which β the readings ask for where the right one is known, on held-out seeds.
+
+    Columns: env, reading, seeds, mean, above (0.8: of how many seeds), below (0.1).
+    """
+    rows = []
+    for env in PLANTED:
+        there = kept_runs.read(kept / "planted" / f"{env}.parquet", READINGS)
+        for reading in (name for name in READINGS if (name, HELD_OUT[0]) in there):
+            runs = (there[reading, seed] for seed in HELD_OUT)
+            ends = np.array([end_of_beta(run) for run in runs])
+            rows.append((env, reading, len(ends), ends.mean(), sum(ends > 0.8), sum(ends < 0.1)))
+    return pd.DataFrame(rows, columns=["env", "reading", "seeds", "mean", "above", "below"])
+
+
 def make(kept: Path, goal: Path, cores: int) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
-    study = read_study([ROOT / "config.yaml"])
+    study = read_study([CONFIG])
     found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
         if (kept / place).exists():
-            runs = asked(kept / place, seeds, study.metrics, cores)
+            runs = asked(kept / place, seeds, study.metrics, cores, BASELINES)
             table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
             by_reading: dict[str, list[float]] = {}
             for (_, name), of_env in runs.items():
@@ -120,11 +171,17 @@ def make(kept: Path, goal: Path, cores: int) -> list[str]:
     betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
     betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
     save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
-    told, pictures = sections(answers, betas), ["specification"]
-    names = ["specification.csv", "comparisons.csv", "deviations.csv"]
+    tasks, planted = in_our_tasks(kept, cores), in_planted(kept)
+    tasks.to_csv(goal / "tasks.csv", index=False)
+    planted.to_csv(goal / "planted.csv", index=False)
+    told = [*sections(answers, betas), *of_tasks(tasks, planted)]
+    names = [
+        f"{name}.csv" for name in ("specification", "comparisons", "deviations", "tasks", "planted")
+    ]
+    pictures = ["specification"]
     if CEILING.exists():
         rows = pd.read_csv(CEILING)
-        metrics = read_study([ROOT / "config.yaml", *CONTROLS]).metrics
+        metrics = read_study([CONFIG, *CONTROLS]).metrics
         gains, effects = ceiling.gains(rows, metrics), ceiling.effects(rows, metrics)
         both = pd.concat([of_oracle(rows, metrics), *earned], ignore_index=True)
         for name, table in {"gains": gains, "effects": effects, "ceiling": both}.items():
@@ -183,6 +240,26 @@ def span(row: pd.Series, name: str, digits: int) -> str:
     """A value with its interval."""
     value, low, high = (f"{row[key]:.{digits}f}".replace("-", "−") for key in (name, "low", "high"))
     return f"{value} ({low} to {high})"
+
+
+def of_tasks(tasks: pd.DataFrame, planted: pd.DataFrame) -> list[Section]:
+    """The tables of tasks in which the weight matters."""
+    shown = tasks.assign(
+        difference=[span(row, "difference", 3) for _, row in tasks.iterrows()],
+        p=tasks["p_holm"].map("{:.4f}".format),
+    )[["claim", "reading", "over", "seeds", "difference", "p", "outcome", "verdict"]]
+    note = (
+        "P1: mean return of training over five tasks in which no constant is good in all; G2: over"
+        " MiniGrid's four. As shares of what solving gives; *p* is corrected for a reading's parts."
+    )
+    ends = planted.assign(mean=planted["mean"].map("{:.3f}".format))
+    what = (
+        "Means over the last tenth of training, seeds 320 to 339: of how many above 0.8, below 0.1."
+    )
+    return [
+        Section("Where the weight matters", note, shown.map(str)),
+        Section("Planted problems: the β that is asked for", what, ends.map(str)),
+    ]
 
 
 ORIGIN = "By `make tables`, from the runs of [the protocol](../../readings/protocol.md)."

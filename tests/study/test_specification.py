@@ -5,16 +5,27 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from invented import CLAIMS, QUICK, ROBUST, ROOT, STUDY, table_for_claims
+from invented import (
+    CLAIMS,
+    QUESTIONED,
+    QUICK,
+    ROBUST,
+    ROOT,
+    STUDY,
+    table_for_claims,
+    table_for_questions,
+)
 
 from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.runs import run
 from mace_rl.runs.finished import FinishedRun
-from mace_study.compare.specification import STILL, asked_beta, family_of, specification
+from mace_study.compare.specification import STILL, asked_beta, family_of, in_tasks, specification
 
 ADVANTAGE = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.3, "mace_words": -0.2}
 WHOLE = ["C1", "C2", "C5", "C6", "C10"]  # all parts are in Acrobot and CartPole
 CUT = ["C7", "C8", "C9"]  # some are
+TASKS = ("DeepSea10-v0", "FrozenLake8x8Deterministic-v0", "NoisyDeepSea6-v0")
+TASKS += ("NoisyDeepSea7-v0", "LateDeepSea7-v0")  # of P1
 
 
 @pytest.mark.parametrize("variant", ["mace_full", "mace_score", "mace_progress", "mace_words"])
@@ -75,3 +86,29 @@ def test_each_reading_is_judged_by_its_own_runs_and_corrected_by_itself():
     still = asked(mace_full=0.2, mace_words=0.04)
     assert still["mace_words", "C9"] == STILL
     assert (still.drop([("mace_words", "C9")]) == both.drop([("mace_words", "C9")])).all()
+
+
+def test_a_claim_of_ours_is_asked_of_each_reading_alone():
+    """P1 has four parts over five tasks: p is corrected for these, by hand for the smallest."""
+    table = table_for_questions(12, mace_full=2.0, beta_1=5.0)
+    other = table[table["variant"] == "mace_full"].assign(variant="mace_words")
+    other["area_under_curve"] -= 4.0
+    both = pd.concat([table, other])
+    path = ROOT / STUDY.claims
+    found = in_tasks(both, QUESTIONED, path, ["mace_full", "mace_words"], "P1", ROBUST)
+    assert found["over"].tolist() == ["ppo", "beta_0.1", "beta_0.4", "beta_1"] * 2
+    verdicts = found.groupby("reading")["verdict"].unique().map(list).to_dict()
+    assert verdicts == {"mace_full": ["no"], "mace_words": ["no"]}
+    own = found[found["reading"] == "mace_full"].set_index("over")
+    assert own["outcome"].tolist() == ["shown"] * 3 + ["reversed"]
+    five = [name for name in both["env"].unique() if name in TASKS]
+    shares = []
+    for env in five:
+        wide = both[both["env"] == env].pivot(
+            index="seed", columns="variant", values="area_under_curve"
+        )
+        scale = QUESTIONED.reference_return[env] - QUESTIONED.random_return[env]
+        shares.append((wide["mace_full"] - wide["ppo"]).mean() / scale)
+    assert own.loc["ppo", "difference"] == pytest.approx(np.mean(shares))
+    alone = in_tasks(both, QUESTIONED, path, ["mace_words"], "P1", ROBUST)
+    pd.testing.assert_frame_equal(alone, found.iloc[4:].reset_index(drop=True))

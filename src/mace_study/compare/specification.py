@@ -4,7 +4,7 @@ Simonsohn, Simmons and Nelson 2020: where an analysis has several reasonable for
 out in each. reference/readings/protocol.md says which, and by what rule.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,37 @@ def specification(
                 rows.append((reading, answer.claim, answer.statement, whole, *said))
     names = ["reading", "claim", "statement", "whole", "outcome", "verdict"]
     return pd.DataFrame(rows, columns=names)
+
+
+def in_tasks(
+    table: pd.DataFrame,
+    settings: MetricsConfig,
+    claims: str | Path,
+    readings: Iterable[str],
+    name: str,
+    how: str,
+) -> pd.DataFrame:
+    """A row for each part of a claim of ours with each reading as the learned β.
+
+    table: as for `specification`; name: of the claim, for each reading a family of its own.
+    Columns: claim, reading, over, seeds, difference, low, high, p_holm, outcome; verdict, of all.
+    """
+    rows: list[Any] = []
+    for reading in readings:
+        [answer] = ledger(table, settings, alone(parse_claims(claims, reading), name))
+        judged = answer.ways[how]
+        for part in judged.parts:
+            found = part.seeds, part.difference, part.low, part.high, part.p_holm, part.outcome
+            rows.append((name, reading, part.baseline, *found, judged.verdict))
+    names = ["seeds", "difference", "low", "high", "p_holm", "outcome", "verdict"]
+    return pd.DataFrame(rows, columns=["claim", "reading", "over", *names])
+
+
+def alone(claims: ClaimsConfig, name: str) -> ClaimsConfig:
+    """One claim, as the only one of its family."""
+    [(title, family)] = [own for own in claims.families.items() if name in own[1].claims]
+    only = family.model_copy(update={"claims": {name: family.claims[name]}})
+    return claims.model_copy(update={"families": {title: only}})
 
 
 def family_of(claims: ClaimsConfig, environments: set[str], whole: bool) -> ClaimsConfig:
