@@ -6,8 +6,6 @@ A part of `make tables`. Only a reading all of whose runs are kept is asked.
 import json
 import statistics
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,23 +90,24 @@ def asked(
     folder: Path,
     seeds: Mapping[str, range],
     settings: MetricsConfig,
-    cores: int,
     baselines: Sequence[str],
 ) -> dict[tuple[str, str], Measured]:
     """By environment and variant the runs of baselines and of the readings that have them all."""
     jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
-    paths = [folder / f"{files.folder_of(env)}.parquet" for env, _ in jobs]
-    ranges, variants = zip(*((seeds[env], name) for env, name in jobs), strict=True)
-    with ProcessPoolExecutor(cores) as pool:
-        made = pool.map(measured, paths, variants, ranges, repeat(settings))
-        found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
+    made = {
+        (env, name): measured(
+            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings
+        )
+        for env, name in jobs
+    }
+    found = {job: runs for job, runs in made.items() if runs}
     whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
     if lacking := [name for name in baselines if name not in whole]:
         raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
     return {job: runs for job, runs in found.items() if job[1] in whole}
 
 
-def in_our_tasks(kept: Path, cores: int) -> pd.DataFrame:
+def in_our_tasks(kept: Path) -> pd.DataFrame:
     """`in_tasks` of `TASKS`."""
     found = []
     for claim, (layers, seeds) in TASKS.items():
@@ -117,7 +116,7 @@ def in_our_tasks(kept: Path, cores: int) -> pd.DataFrame:
         [family] = alone(parse_claims(path), claim).families.values()
         [part] = family.claims[claim].parts[DECIDES]
         each = dict.fromkeys(part.environments, seeds)
-        runs = asked(kept / layers[-1], each, study.metrics, cores, part.over)
+        runs = asked(kept / layers[-1], each, study.metrics, part.over)
         table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
         readings = [name for name in READINGS if name in set(table["variant"])]
         found.append(in_tasks(table, study.metrics, path, readings, claim, DECIDES))
@@ -139,13 +138,13 @@ def in_planted(kept: Path) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["env", "reading", "seeds", "mean", "above", "below"])
 
 
-def make(kept: Path, goal: Path, cores: int) -> list[str]:
+def make(kept: Path, goal: Path) -> list[str]:
     """Make what the module says; returns the names, none if no world is there."""
     study = read_study([CONFIG])
     found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
         if (kept / place).exists():
-            runs = asked(kept / place, seeds, study.metrics, cores, BASELINES)
+            runs = asked(kept / place, seeds, study.metrics, BASELINES)
             table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
             by_reading: dict[str, list[float]] = {}
             for (_, name), of_env in runs.items():
@@ -171,7 +170,7 @@ def make(kept: Path, goal: Path, cores: int) -> list[str]:
     betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
     betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
     save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
-    tasks, planted = in_our_tasks(kept, cores), in_planted(kept)
+    tasks, planted = in_our_tasks(kept), in_planted(kept)
     tasks.to_csv(goal / "tasks.csv", index=False)
     planted.to_csv(goal / "planted.csv", index=False)
     told = [*sections(answers, betas), *of_tasks(tasks, planted)]

@@ -169,13 +169,15 @@ def main() -> None:
     threadpool_limits(1)  # in each process
     try:
         with ProcessPoolExecutor(cores) as pool:
+            readings = pool.submit(specification.make, KEPT, MADE / READINGS)
             made = dict(zip(STUDIES, pool.map(make, STUDIES), strict=True))
-    except ValueError as error:
+            asked = readings.result()
+    except (Refusal, ValueError) as error:
         sys.exit(f"tables: {error}")
     outputs = {name: kept_outputs for name, (_, kept_outputs) in made.items()}
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
-    if asked := specification.make(KEPT, MADE / READINGS, cores):
+    if asked:
         outputs[READINGS] = asked
     every = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
