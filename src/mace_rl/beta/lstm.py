@@ -1,6 +1,6 @@
 """Long short-term memory and a readout in compiled code, with gradients by backpropagation in time.
 
-For 16 units a tensor library's calls take longer than the work in them. All arithmetic is float32
+For so few units a tensor library's calls take longer than the work in them. All arithmetic is float32
 in a fixed order, the same bits on every processor.
 """
 
