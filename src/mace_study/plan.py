@@ -4,7 +4,8 @@ Planning the workflow imports this module, so it stays clear of torch and numba.
 """
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,11 @@ from mace_study.config.study import Study
 from mace_study.measure.metrics import all_metrics, out_of_reach
 
 FIGURES = ("figure1", "figure2")  # over training: 1 is the paper's, 2 shows β
+
+
+def one_of(values: Iterable[Any]) -> str:
+    """A pattern that matches exactly these values, without any nothing."""
+    return "|".join(re.escape(str(value)) for value in values) or "(?!)"
 
 
 class Plan:

@@ -3,7 +3,6 @@
 import mace_rl.base.cpu_features  # before NumPy: equal bits on every processor; the jobs inherit it
 import json
 import os
-import re
 import shlex
 import sys
 from functools import reduce
@@ -15,7 +14,7 @@ from mace_rl.config.section import ConfigError
 from mace_study.config.study import load_study
 from mace_rl.config.plugins import source_files
 from mace_rl.environments import registered
-from mace_study.plan import FIGURES, Plan
+from mace_study.plan import FIGURES, Plan, one_of
 from mace_rl.runs import provenance, slurm
 from mace_rl.runs.finished import in_the_way
 from mace_rl.base.code_digest import digest
@@ -62,15 +61,10 @@ def shown(file, caption, category="Results"):
     return report(f"{RESULTS}/{file}", caption=f"../report/{caption}.rst", category=category)
 
 
-def one_of(values):
-    """A pattern that matches exactly these values, without any nothing."""
-    return "|".join(re.escape(str(value)) for value in values) or "(?!)"
-
-
 wildcard_constraints:
     env=one_of(FOLDERS),
     variant=one_of(plan.trained),
-    seed=one_of({seed: None for _, _, seed in plan.runs}),
+    seed=one_of(dict.fromkeys(seed for _, _, seed in plan.runs)),
 
 
 def run_config(wildcards):
