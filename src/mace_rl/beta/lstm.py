@@ -1,7 +1,7 @@
 """Long short-term memory and a readout in compiled code, with gradients by backpropagation in time.
 
-For so few units a tensor library's calls take longer than the work in them. All arithmetic is float32
-in a fixed order, the same bits on every processor.
+For so few units a library of tensors takes longer to be called than to compute. All arithmetic is
+float32 in a fixed order, the same bits on every processor.
 """
 
 from pathlib import Path
