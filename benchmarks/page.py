@@ -44,20 +44,9 @@ def write(folder: Path) -> Path:
 
 def speed_section(rows: pd.DataFrame) -> str:
     """Steps per CPU second of everybody, with the ratio to the reference within each repeat."""
-    steps = rows.pivot_table(index="contestant", columns="env", values="steps", aggfunc="median")
     share = (rows["cpu_seconds"] / rows["seconds"]).median()
-    return "\n\n".join(
-        [
-            rates_table(rows, speed.LABELS),
-            by_environment(
-                "steps of a training, median",
-                steps.reindex(speed.LABELS).dropna(how="all"),
-                ",.0f",
-                speed.LABELS,
-            ),
-            f"The measured processes had the processor for {share:.0%} of the time (median).",
-        ]
-    )
+    note = f"The measured processes had the processor for {share:.0%} of the time (median)."
+    return f"{rates_table(rows, speed.LABELS)}\n\n{note}"
 
 
 def purejaxrl_section(rows: pd.DataFrame) -> str:
@@ -115,23 +104,7 @@ def draw_speed(rows: pd.DataFrame) -> plt.Figure:
     return figure
 
 
-def draw_breakdown(rows: pd.DataFrame) -> plt.Figure:
-    """µs per step by part of the program, stacked."""
-    figure, panels = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    times = rows.assign(time=1e6 * rows["seconds"] / rows["steps"])
-    for panel, environment in zip(panels, ENVIRONMENTS, strict=True):
-        table = times[times["env"] == environment].pivot(
-            index="contestant", columns="part", values="time"
-        )
-        table = table.loc[list(speed.OURS), breakdown.ALL_SECTIONS].clip(lower=0)
-        table.plot.bar(stacked=True, ax=panel, colormap="tab10", legend=False, rot=0)
-        panel.set(title=environment, xlabel="", ylabel="µs per environment step")
-        panel.set_ylim(0, 1.05 * table.sum(axis=1).max())
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", reverse=True)
-    return figure
-
-
-PICTURES = {"speed": draw_speed, "breakdown": draw_breakdown}
+PICTURES = {"speed": draw_speed}
 
 
 def rates(rows: pd.DataFrame) -> pd.Series:
@@ -147,18 +120,10 @@ def rates_table(rows: pd.DataFrame, labels: dict[str, str]) -> str:
         reference = rates(rows)[environment, speed.REFERENCE]
         ratio = (rate.droplevel(["env", "contestant"]) / reference).median()
         cells[contestant, environment] = f"{median_and_range(rate, ',.0f')}, {ratio:.1f}×"
-    table = pd.Series(cells).unstack().reindex(labels)
-    return by_environment(f"{RATE} (× {labels[speed.REFERENCE]})", table, "", labels)
-
-
-def by_environment(
-    name: str, table: pd.DataFrame, form: str, labels: dict[str, str] | None = None
-) -> str:
-    """`table`, whose columns are environments and whose index is called `name`."""
+    table = pd.Series(cells).unstack().reindex(labels).rename(index=labels).fillna("–")
     there = [environment for environment in ENVIRONMENTS if environment in table]
-    cells = table[there].map(lambda value: format(value, form), na_action="ignore").fillna("–")
-    cells = cells.rename(index=labels or {})
-    return markdown(cells.reset_index(names=name), there)
+    name = f"{RATE} (× {labels[speed.REFERENCE]})"
+    return markdown(table[there].reset_index(names=name), there)
 
 
 def median_and_range(values: pd.Series, form: str) -> str:

@@ -139,57 +139,52 @@ def in_planted(kept: Path) -> pd.DataFrame:
 
 
 def make(kept: Path, goal: Path) -> list[str]:
-    """Make what the module says; returns the names, none if no world is there."""
+    """Make what the module says, in the folder `goal`; returns the names of the files."""
     study = read_study([CONFIG])
     found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
-        if (kept / place).exists():
-            runs = asked(kept / place, seeds, study.metrics, BASELINES)
-            table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
-            by_reading: dict[str, list[float]] = {}
-            for (_, name), of_env in runs.items():
-                by_reading.setdefault(name, []).extend(of_env.deviations)
-            deviations = {
-                name: statistics.median(by_reading[name]) for name in READINGS if name in by_reading
-            }
-            first = {job: of_env.first for job, of_env in runs.items()}
-            earned.append(ceiling.over_ppo(first, study.metrics).assign(world=world))
-            own = specification(table, study.metrics, ROOT / study.claims, deviations, DECIDES)
-            found.append(own.assign(world=world))
-            pairs = [[name, other] for name in deviations for other in BASELINES]
-            own = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
-            compared.append(own[own["env"] != ALL].assign(world=world))
-            moved[world] = deviations
-    if not found:
-        return []
-    answers = pd.concat(found, ignore_index=True)
+        runs = asked(kept / place, seeds, study.metrics, BASELINES)
+        table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
+        by_reading: dict[str, list[float]] = {}
+        for (_, name), of_env in runs.items():
+            by_reading.setdefault(name, []).extend(of_env.deviations)
+        moved[world] = {
+            name: statistics.median(by_reading[name]) for name in READINGS if name in by_reading
+        }
+        first = {job: of_env.first for job, of_env in runs.items()}
+        earned.append(ceiling.over_ppo(first, study.metrics).assign(world=world))
+        own = specification(table, study.metrics, ROOT / study.claims, moved[world], DECIDES)
+        found.append(own.assign(world=world))
+        pairs = [[name, other] for name in moved[world] for other in BASELINES]
+        own = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
+        compared.append(own[own["env"] != ALL].assign(world=world))
+    forks, metrics = pd.read_csv(CEILING), read_study([CONFIG, *CONTROLS]).metrics
+    tables = {
+        "specification": pd.concat(found, ignore_index=True),
+        "comparisons": pd.concat(compared),
+        "deviations": pd.DataFrame(moved).round(4).rename_axis("reading").reset_index(),
+        "tasks": in_our_tasks(kept),
+        "planted": in_planted(kept),
+        "gains": ceiling.gains(forks, metrics),
+        "effects": ceiling.effects(forks, metrics),
+        "ceiling": pd.concat([of_oracle(forks, metrics), *earned], ignore_index=True),
+    }
+    answers = tables["specification"]
     shown = [name for name in READINGS if name in set(answers["reading"])]
+    pictures = {
+        "specification": worlds.draw_specification(answers, shown),
+        "ceiling": worlds.draw_gains(tables["ceiling"]),
+    }
+    told = [*sections(answers, tables["deviations"])]
+    told += of_tasks(tables["tasks"], tables["planted"])
+    told += of_ceiling(tables["gains"], tables["effects"])
     goal.mkdir(parents=True, exist_ok=True)
-    answers.to_csv(goal / "specification.csv", index=False)
-    pd.concat(compared).to_csv(goal / "comparisons.csv", index=False)
-    betas = pd.DataFrame(moved).rename_axis("reading").reset_index()
-    betas.to_csv(goal / "deviations.csv", index=False, float_format="%.4f")
-    save_figure(worlds.draw_specification(answers, shown), goal / "specification.png")
-    tasks, planted = in_our_tasks(kept), in_planted(kept)
-    tasks.to_csv(goal / "tasks.csv", index=False)
-    planted.to_csv(goal / "planted.csv", index=False)
-    told = [*sections(answers, betas), *of_tasks(tasks, planted)]
-    names = [
-        f"{name}.csv" for name in ("specification", "comparisons", "deviations", "tasks", "planted")
-    ]
-    pictures = ["specification"]
-    if CEILING.exists():
-        rows = pd.read_csv(CEILING)
-        metrics = read_study([CONFIG, *CONTROLS]).metrics
-        gains, effects = ceiling.gains(rows, metrics), ceiling.effects(rows, metrics)
-        both = pd.concat([of_oracle(rows, metrics), *earned], ignore_index=True)
-        for name, table in {"gains": gains, "effects": effects, "ceiling": both}.items():
-            table.to_csv(goal / f"{name}.csv", index=False)
-            names.append(f"{name}.csv")
-        save_figure(worlds.draw_gains(both), goal / "ceiling.png")
-        told, pictures = [*told, *of_ceiling(gains, effects)], [*pictures, "ceiling"]
-    (goal / "README.md").write_text(page("readings", ORIGIN, told, pictures), encoding="utf-8")
-    return [*names, *(f"{name}.png" for name in pictures), "README.md"]
+    for name, table in tables.items():
+        table.to_csv(goal / f"{name}.csv", index=False)
+    for name, picture in pictures.items():
+        save_figure(picture, goal / f"{name}.png")
+    (goal / "README.md").write_text(page("readings", ORIGIN, told, [*pictures]), encoding="utf-8")
+    return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
 
 
 def of_oracle(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:

@@ -177,8 +177,7 @@ def main() -> None:
     outputs = {name: kept_outputs for name, (_, kept_outputs) in made.items()}
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
-    if asked:
-        outputs[READINGS] = asked
+    outputs[READINGS] = asked
     every = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in every if path.suffix == ".png"]))
