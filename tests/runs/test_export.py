@@ -69,20 +69,6 @@ def test_runs_of_one_name_are_told_apart_by_their_folder(runs, monkeypatch, tmp_
     }
 
 
-def test_the_page_s_interquartile_mean(trained, monkeypatch, tmp_path, capsys):
-    """Of the last tenth of 10 episodes, the last one, over 4 seeds: the mean of the middle two."""
-    for seed in range(4):
-        shutil.copytree(trained("CartPole-v1", "ppo", seed, episodes=10), tmp_path / str(seed))
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "export", ".", "--out", "runs.csv") == (0, "")
-    last = [pd.read_csv(f"{seed}/episodes.csv")["extrinsic_return"].iloc[-1] for seed in range(4)]
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-    *_, example = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
-    capsys.readouterr()
-    exec(example, {})
-    assert f"{sum(sorted(last)[1:3]) / 2:.1f}" in capsys.readouterr().out
-
-
 def test_mistakes_get_one_line(runs, monkeypatch, tmp_path):
     def said_of(out: str) -> str:
         return refusal(monkeypatch, "export", str(runs), "--out", str(tmp_path / out))

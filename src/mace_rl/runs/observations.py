@@ -1,4 +1,10 @@
-"""Observations as an environment gives them, one or many, to the vectors that agents train on."""
+"""Observations as an environment gives them, one or many, to the vectors that agents train on.
+
+Discrete: an integer; integers [N]; one-hot vectors [..., n], one alone only of floats. Box,
+MultiDiscrete, MultiBinary: an array of its shape; [N, *shape]; flat vectors [..., size]. Tuple,
+Dict: one with each part as above, with arrays [N, ...] in it for a batch; a list of such; flat
+vectors. Arrays, lists and torch tensors do.
+"""
 
 from collections.abc import Mapping
 from contextlib import suppress
