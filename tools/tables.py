@@ -177,7 +177,8 @@ def main() -> None:
     outputs = {name: kept_outputs for name, (_, kept_outputs) in made.items()}
     if together := worlds.make(MADE):
         outputs[worlds.FOLDER] = together
-    outputs[READINGS] = asked
+    if asked:
+        outputs[READINGS] = asked
     every = [MADE / name / output for name, own in outputs.items() for output in own]
     with ProcessPoolExecutor(cores) as pool:
         list(pool.map(reduce_colours, [path for path in every if path.suffix == ".png"]))
