@@ -139,7 +139,7 @@ def in_planted(kept: Path) -> pd.DataFrame:
 
 
 def make(kept: Path, goal: Path) -> list[str]:
-    """Make what the module says, in `goal`; returns the files' names, none if a world is lacking."""
+    """Make what the module says; returns the files' names in `goal`, none if a world is lacking."""
     if not all((kept / place).exists() for place, _ in WORLDS.values()):
         return []
     study = read_study([CONFIG])
