@@ -132,8 +132,7 @@ def in_planted(kept: Path) -> pd.DataFrame:
     for env in PLANTED:
         there = kept_runs.read(kept / "planted" / f"{env}.parquet", READINGS)
         for reading in (name for name in READINGS if (name, HELD_OUT[0]) in there):
-            runs = (there[reading, seed] for seed in HELD_OUT)
-            ends = np.array([end_of_beta(run) for run in runs])
+            ends = np.array([end_of_beta(there[reading, seed]) for seed in HELD_OUT])
             rows.append((env, reading, len(ends), ends.mean(), sum(ends > 0.8), sum(ends < 0.1)))
     return pd.DataFrame(rows, columns=["env", "reading", "seeds", "mean", "above", "below"])
 
