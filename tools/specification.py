@@ -272,7 +272,7 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
         frame = order.merge(wide).merge(same, "left", left_on="claim", right_index=True).fillna("")
         frame = frame.sort_values("claim", key=lambda names: names.str[1:].astype(int))
         note = (
-            "†: the claim is about Hopper, too, whose runs are of the default alone; asked of the"
+            "†: the claim is about Hopper, too, where these readings have no runs; asked of the"
             f" other environments, and not counted. *As the default*: readings with {DEFAULT}'s"
             " answer, of all."
         )

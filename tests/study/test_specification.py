@@ -1,5 +1,6 @@
 """The paper's claims asked of every reading: families, cut claims, and whether β moves."""
 
+import json
 import math
 
 import numpy as np
@@ -20,6 +21,8 @@ from mace_rl.beta.meta import MetaAdaptation
 from mace_rl.runs import run
 from mace_rl.runs.finished import FinishedRun
 from mace_study.compare.specification import STILL, asked_beta, family_of, in_tasks, specification
+from tools.kept_runs import Kept
+from tools.specification import end_of_beta
 
 ADVANTAGE = {"ppo": 0.0, "mace_fixed": 0.05, "mace_full": 0.3, "mace_words": -0.2}
 WHOLE = ["C1", "C2", "C5", "C6", "C10"]  # all parts are in Acrobot and CartPole
@@ -112,3 +115,11 @@ def test_a_claim_of_ours_is_asked_of_each_reading_alone():
     assert own.loc["ppo", "difference"] == pytest.approx(np.mean(shares))
     alone = in_tasks(both, QUESTIONED, path, ["mace_words"], "P1", ROBUST)
     pd.testing.assert_frame_equal(alone, found.iloc[4:].reset_index(drop=True))
+
+
+def test_the_end_of_a_run_is_its_last_tenth(run_config):
+    """Of a β that nothing perturbs: as it is recorded."""
+    config = run_config("CartPole-v1", "mace_words", 3, episodes=30)
+    record = json.dumps({"config": config.settings()})
+    betas = pd.DataFrame({"beta": np.repeat([0.9, 0.2, 0.5], [26, 2, 2])})
+    assert end_of_beta(Kept(record, betas)) == pytest.approx((0.2 + 0.5 + 0.5) / 3)

@@ -11,7 +11,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Text, Tuple, flatdim, flatten
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import TimeLimit, TransformObservation
+from gymnasium.wrappers import TransformObservation
 from shared import BANDIT, play, step, vector_of
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
@@ -324,47 +324,3 @@ def test_defaults_are_the_study_s(run_config):
     sections = {name: settings[name] for name in ("memory", "novelty")}
     assert config == CuriosityConfig(beta=0.4, **sections)
     assert config.discount == settings["ppo"]["discount"]
-
-
-def limited_outside(env, steps):
-    return TimeLimit(CuriosityReward(env, 0.4), steps)
-
-
-def limited_inside(env, steps):
-    return CuriosityReward(TimeLimit(env, steps), 0.4)
-
-
-def limited_as_a_vector(env, steps):
-    vector = VectorCuriosityReward(SyncVectorEnv([lambda: env]), 0.4)
-
-    class Limited(gymnasium.Wrapper):
-        def __init__(self):
-            self.env, self.count = vector, 0
-
-        def reset(self, **given):
-            self.count = 0
-            return vector.reset(**given)
-
-        def step(self, action):
-            self.count += 1
-            observation, reward, ended, _, info = vector.step(np.array([action]))
-            return observation, float(reward[0]), bool(ended[0]), self.count == steps, info
-
-    limited = Limited()
-    limited.action_space = env.action_space
-    return limited
-
-
-@pytest.mark.parametrize("form", [limited_outside, limited_inside, limited_as_a_vector])
-def test_a_bonus_is_paid_wherever_the_time_limit_is(form):
-    env = form(gymnasium.make("MountainCar-v0").unwrapped, 50)
-    extrinsic = -1.0  # each step's
-    env.reset(seed=0)
-    paid = 0.0
-    for number in range(400):
-        env.action_space.seed(number)
-        _, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        paid += abs(reward - extrinsic)
-        if terminated or truncated:
-            env.reset()
-    assert paid > 1

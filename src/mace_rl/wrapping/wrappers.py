@@ -80,7 +80,8 @@ class CuriosityMixin(RecordConstructorArgs):
 
         Numbers, texts, lists, dictionaries and tensors, which `torch.load` reads with
         `weights_only`; `CheckpointError` if a rule for β has others. The states of the environment
-        and the agent are not in it.
+        and the agent are not in it. From dozens of processes of a SubprocVecEnv each tensor takes
+        an open file, unless these call `torch.multiprocessing.set_sharing_strategy("file_system")`.
         """
         state = self.tracker.state_dict()
         require_plain(state, "the state")
