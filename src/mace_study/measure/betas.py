@@ -39,12 +39,21 @@ def betas_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) 
     rows = []
     for run, frame in runs.items():
         beta, returns = frame["beta"].to_numpy(), frame["extrinsic_return"].to_numpy()
-        curve = metrics.learning_curve(returns, run[0], settings)
         end = metrics.final_return(beta, settings.final_fraction)
-        found = [stagnation_correlation(curve.returns, beta, settings.moving_average)]
-        found += stagnation_correlations(curve, beta) if settings.reference_return else []
+        found = correlations(returns, beta, run[0], settings)
         rows.append([*run, end, beta.min(), beta.max(), *found])
     return pd.DataFrame(rows, columns=list(betas_columns(settings)))
+
+
+def correlations(
+    returns: np.ndarray, betas: np.ndarray, environment: str, settings: MetricsConfig
+) -> list[float]:
+    """The stagnation correlations of a run, as betas.csv has them; returns, betas: [E]."""
+    if np.ptp(betas) == 0:
+        return [0.0] * (3 if settings.reference_return else 1)
+    curve = metrics.learning_curve(returns, environment, settings)
+    found = [stagnation_correlation(returns, betas, settings.moving_average)]
+    return [*found, *(stagnation_correlations(curve, betas) if settings.reference_return else ())]
 
 
 def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
