@@ -38,13 +38,8 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
     records = kept(ROOT / "reference" / "worlds" / folder)
     names = [name for name in tables.STUDIES if tables.ELSEWHERE.get(name, name) == folder]
     asked = {run for name in names for run in world(name).runs()}
-    for place, seeds in specification.WORLDS.values():
-        if place == folder:
-            cells = product(seeds, specification.READINGS)
-            asked |= {(env, name, seed) for env, name in cells for seed in seeds[env]}
-    if folder in ("planted", "tasks", "minigrid"):
-        cells = product(asked, specification.READINGS)
-        asked |= {(env, name, seed) for (env, _, seed), name in cells}
+    cells = product(asked, specification.READINGS)
+    asked |= {(env, name, seed) for (env, _, seed), name in cells}
     assert {*records} <= asked
     git, told = ["git", "-C", str(ROOT)], {"capture_output": True}
     shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)

@@ -20,7 +20,11 @@ from mace_study.measure.metrics import metric_labels, metric_units
 COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
 DASH = "\u2013"  # in the place of a number that there is not
 SIZES = ("room", "margin", "detectable")  # beside a difference
-CENSORED = "of the seeds never got there and count with the whole budget"  # and their mark: †
+# The mark †: what never attains a metric in episodes, or has not learned (docs/metrics.md).
+CENSORED = (
+    "of the seeds never got there, or ended no better than random actions, and count with the whole"
+    " budget"
+)
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
 
