@@ -55,14 +55,14 @@ def test_effect_and_noise_by_hand():
 def test_where_beta_has_no_effect_the_oracle_gains_nothing(monkeypatch):
     """What is reported is not what was chosen by: its mean is that of a constant, by chance."""
     monkeypatch.setattr(ceiling, "STEP", 3)
-    monkeypatch.setattr(ceiling, "LAST", 15)
+    monkeypatch.setattr(ceiling, "LAST", 9)
     monkeypatch.setattr(ceiling, "STREAMS", 2)
     novelty = {"kind": "custom", "estimator": "test_ceiling:NoBonus"}
     gains, chosen = [], []
     for seed in range(800, 830):
         config = settings("CartPole-v1", "mace_fixed", seed=seed, novelty=novelty)
         mean, forks = ceiling.oracle(config, 10)
-        constant = ceiling.with_beta(config.model_copy(update={"episodes": 15}), 0.4)
+        constant = ceiling.with_beta(config.model_copy(update={"episodes": 9}), 0.4)
         expected = ceiling.returns(finish(constant), 0).mean()
         gains.append(mean - expected)
         chosen.append(forks.mean(axis=(2, 3)).max(axis=1).mean() - forks.mean())

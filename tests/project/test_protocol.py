@@ -107,7 +107,7 @@ def by_all_patterns(part: dict, kind: str, runs: pd.DataFrame, study: Study) -> 
     sides = []
     for sign in (1, -1):
         shares = [(sign * own - margin) / len(own) for own in differences]  # of a mean of means
-        sides.append(as_low(np.rint(np.concatenate(shares) / 1e-6).astype(int)))
+        sides.append(as_low(np.rint(np.concatenate(shares) / 1e-5).astype(int)))
     return max(sides) if margin else 2 * min(sides)
 
 

@@ -132,9 +132,9 @@ def mean_curves(
 
 
 def read_curves(path: Path) -> pd.DataFrame:
-    """What `seed_curves` or `mean_curves` was written as, to the bit."""
-    how: Any = {"keep_default_na": False, "na_values": [""], "float_precision": "round_trip"}
-    return pd.read_csv(path, dtype={"env": str, "variant": str}, **how)
+    """What `seed_curves` or `mean_curves` was written as, to the bit (pandas 3.1.0 and later)."""
+    names = {"env": str, "variant": str}
+    return pd.read_csv(path, dtype=names, keep_default_na=False, na_values=[""])
 
 
 def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
