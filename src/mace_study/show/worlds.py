@@ -145,23 +145,29 @@ def draw_gains(table: pd.DataFrame) -> Figure:
     """
     order = ["plain", "tuned"]
     ranked = table["world"].map(lambda world: order.index(world) if world in order else len(order))
-    groups = table.iloc[np.argsort(ranked, kind="stable")].groupby(["world", "env"], sort=False)
-    most = int(table.groupby(["world", "env"]).size().max())
+    oracles = table["variant"].str.startswith("oracle")
+    places = np.lexsort([~oracles, ranked])  # which keeps the order of what is alike
+    groups = table.iloc[places].groupby(["world", "env"], sort=False)
+    longest = groups.size().groupby(np.arange(groups.ngroups) // 2).max()  # by row of panels
     ends = table[["low", "high"]].to_numpy()
     margin = 0.05 * np.ptp(ends)
     with style():
-        figure, panels = grid(groups.ngroups, 2, "Gain over PPO", height=LINE * (1.4 * most + 4))
-        for ((world, env), own), axes in zip(groups, panels, strict=True):
+        figure, panels = grid(groups.ngroups, 2, "Gain over PPO")
+        heights = [LINE * (1.4 * most + 4) for most in longest]
+        figure.set_figheight(sum(heights) + LEGEND_HEIGHT)
+        rows: Any = panels[0].get_gridspec()
+        rows.set_height_ratios(heights)
+        for number, (((world, env), own), axes) in enumerate(zip(groups, panels, strict=True)):
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
-            rows: Any = own.itertuples()
-            for place, row in enumerate(rows):
+            runs: Any = own.itertuples()
+            for place, row in enumerate(runs):
                 oracle = row.variant.startswith("oracle")
                 colour = COLOURS[2] if oracle else COLOURS[0]
                 axes.hlines(place, row.low, row.high, color=colour, linewidth=1.2)
                 label = "oracle" if oracle else "learned, fixed or constant β"
                 dot: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(row.gain, place, "o", **dot)
-            axes.set(title=f"{env} ({world})", ylim=(most - 0.5, -0.5))
+            axes.set(title=f"{env} ({world})", ylim=(longest[number // 2] - 0.5, -0.5))
             axes.set_xlim(ends.min() - margin, ends.max() + margin)
             axes.set_yticks(range(len(own)), list(own["variant"]), fontsize="x-small")
         shares = f"In the first {LAST} episodes, as shares of what solving gives."
