@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # gymnasium 1.4.0: with a seed, make_vec("CartPole-v1") begins nowhere that make("CartPole-v1") does.
-# Expected: reset(seed=0) of n environments begins number i as make(...).reset(seed=i), as vector
-#   environments are documented to seed theirs, and the first one's start does not depend on n.
+# Expected: reset(seed=0) of n environments begins number i as make(...).reset(seed=i), which is what
+#   SyncVectorEnv documents, and the first one's start does not depend on n.
 # Behaviour: by default make_vec takes a CartPole of its own, which fills an array of all starts from one
 #   generator, variable by variable. So the same seed gives other episodes, and others for each n.
 # Seen: sync like make, default unlike make; first of 1, 2, 3: other, other

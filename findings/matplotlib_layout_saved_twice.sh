@@ -2,7 +2,7 @@
 # matplotlib 3.11.2: a figure that is saved twice, with nothing changed between, is another picture.
 # Expected: a layout engine finds the same places for the same figure, so equal PNG files.
 # Behaviour: a layout is found anew at each saving, from where the last one left the axes, and these end
-#   parts of a pixel apart; with "tight" it never settles. So a PNG also hangs on whether a PDF was saved first.
+#   parts of a pixel apart; with "tight" it never settles.
 # Seen: constrained differs, then settles; tight differs each time; none is equal
 set -euo pipefail
 folder=$(mktemp -d)

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# numba 0.68.1: np.mean and np.std of float32 lose all digits that NumPy keeps.
+# numba 0.68.1: np.mean and np.std of float32 are far from NumPy's.
 # Expected: inside a compiled function they differ from NumPy's by rounding.
 # Behaviour: NumPy adds float32 pairwise; numba one after the other, in float32. Of a million numbers around
-#   1000, of deviation 1, as observations or returns are, the mean is 9 too large and the deviation 9 times.
+#   1000, of deviation 1, as observations or returns are, the mean is 9 too large and the deviation ninefold.
 # Seen: NumPy 1000.0 and 1.0, numba 1008.9 and 9.0
 set -euo pipefail
 folder=$(mktemp -d)

@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
 # numba 0.68.1: each array that a compiled function returns costs a call into Python, which unpickles.
 # Expected: a compiled function gives its results back in C; arguments are read so.
-# Behaviour: for each array, numba.core.serialize._numba_unpickle looks up numpy.ndarray again. Of a
-#   function that is called once an episode and returns ten arrays this is most of what a call costs.
+# Behaviour: for each array, numba.core.serialize._numba_unpickle looks up numpy.ndarray again.
 # Seen: unpickled: 0 for three arguments, 1 for an array, 3 for three arrays, 0 for a number
 set -euo pipefail
 folder=$(mktemp -d)

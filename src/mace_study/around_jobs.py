@@ -77,4 +77,4 @@ def title(plan: Plan) -> str:
     name = f"Table 1: {caption[0].lower()}{caption[1:]}"
     if not counts_episodes(plan.measured, plan.paper.table1):
         return f"{name}; *: best"
-    return f"{name} in episodes; *: lowest; †k: k seeds never get there"
+    return f"{name} in episodes; *: lowest; †k: k seeds do not succeed"

@@ -121,10 +121,11 @@ def test_gains_over_ppo_are_shares_of_all_there_is():
 def test_the_picture_has_a_panel_for_each_task_and_one_axis():
     own = {"env": "CartPole-v1", "seeds": 20, "gain": 0.1, "low": 0.0, "high": 0.3}
     rows = [own | {"world": "control", "variant": "oracle, H = 20", "low": -0.4}]
-    rows += [own | {"world": "plain", "variant": name} for name in ("oracle, H = 20", "mace_full")]
+    names = "oracle, H = 20", "mace_full", "oracle, H = 50"
+    rows += [own | {"world": "plain", "variant": name} for name in names]
     panels = draw_gains(pd.DataFrame(rows)).axes
     assert [axes.get_title() for axes in panels] == ["CartPole-v1 (plain)", "CartPole-v1 (control)"]
     assert len({axes.get_xlim() for axes in panels}) == 1
     assert panels[0].get_xlim()[0] < -0.4 and panels[0].get_xlim()[1] > 0.3
     labels = [[label.get_text() for label in axes.get_yticklabels()] for axes in panels]
-    assert labels == [["oracle, H = 20", "mace_full"], ["oracle, H = 20"]]
+    assert labels == [["oracle, H = 20", "oracle, H = 50", "mace_full"], ["oracle, H = 20"]]

@@ -15,7 +15,9 @@ def run(words: list[str], folder: Path, environment: dict[str, str], output: Pat
     process = FORKS.Process(target=_run, args=(words, folder, environment, output))
     process.start()
     process.join(900)
-    assert process.exitcode is not None, "it does not end"
+    if process.exitcode is None:
+        process.kill()
+        raise TimeoutError(f"{words} does not end")
     return process.exitcode
 
 

@@ -25,10 +25,14 @@ LABELS = {  # of columns, in tables
 }
 
 
+def correlation_columns(settings: MetricsConfig) -> tuple[str, ...]:
+    """Those of `CORRELATIONS` that there are; without a common bar nothing is before or after."""
+    return CORRELATIONS if settings.reference_return else (CORRELATION,)
+
+
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:
-    """The columns of betas.csv; without a common bar nothing is before or after it."""
-    correlations = CORRELATIONS if settings.reference_return else [CORRELATION]
-    values = dict.fromkeys([*metrics.OF_BETAS[:3], *correlations], float)
+    """The columns of betas.csv."""
+    values = dict.fromkeys([*metrics.OF_BETAS[:3], *correlation_columns(settings)], float)
     return {"env": str, "variant": str, "seed": int} | values
 
 
@@ -50,7 +54,7 @@ def correlations(
 ) -> list[float]:
     """The stagnation correlations of a run, as betas.csv has them; returns, betas: [E]."""
     if np.ptp(betas) == 0:
-        return [0.0] * (3 if settings.reference_return else 1)
+        return [0.0] * len(correlation_columns(settings))
     curve = metrics.learning_curve(returns, environment, settings)
     found = [stagnation_correlation(returns, betas, settings.moving_average)]
     return [*found, *(stagnation_correlations(curve, betas) if settings.reference_return else ())]

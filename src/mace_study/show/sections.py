@@ -143,7 +143,7 @@ def _others(
     if "readings" in data:
         note = (
             "Means in episodes, the lowest first; bold if a log-rank test against each of the"
-            " others has p < 0.05, not corrected. †: some runs never got there."
+            " others has p < 0.05, not corrected. †: some runs never got there, or learned nothing."
         )
         frame = tables.readings(data["readings"], settings)
         yield Section("What decides the ranking", note, frame)
