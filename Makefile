@@ -53,7 +53,7 @@ bench: setup ## speed and memory beside others (an hour); BENCH=quick: is a chan
 	@$(IN_VENV) $(if $(BENCH),benchmarks.guard,benchmarks)
 
 verify: setup ## repeat some of the twelve short runs, one each of tuned, plain, our tasks, MiniGrid: to the bit (SAMPLE=3)
-	@$(IN_VENV) mace_rl.cli verify reference --sample $(or $(SAMPLE),3)
+	@$(IN_VENV) mace_rl verify reference --sample $(or $(SAMPLE),3)
 	for world in tuned plain tasks minigrid; do
 	    $(IN_VENV) tools.kept_runs verify reference/worlds/$$world --sample 1
 	done

@@ -18,7 +18,7 @@ from mace_study.measure.betas import BEFORE, CORRELATION
 from mace_study.measure.metrics import LearningCurve, Metric, final_return, metrics_columns
 
 SETTINGS = {"final_fraction": 0.1, "threshold": 0.75, "moving_average": 50, "comparisons": []}
-SETTINGS |= {"convergence_slope": 0.1, "convergence_band": 0.1, "confidence": 0.95}
+SETTINGS |= {"convergence_slope": 0.1, "confidence": 0.95}
 SETTINGS |= {"bootstrap_repetitions": 1000, "bootstrap_seed": 0}
 SETTINGS["random_return"] = {"CartPole-v1": 22.1, "Acrobot-v1": -499.1}
 SETTINGS["reference_return"] = {"CartPole-v1": 400.0, "Acrobot-v1": -200.0}

@@ -23,7 +23,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from mace_rl import cli
-from mace_rl.agent.policy import ActingPolicy, CompiledActing, NetworkActing, Policy
+from mace_rl.agent.compiled_learner import CompiledLearner
+from mace_rl.agent.policy import ActingPolicy, NetworkActing, Policy
 from mace_rl.agent.torch_policy import Categoricals
 from mace_rl.base.files import LOCK
 from mace_rl.config.run import RunConfig
@@ -136,7 +137,7 @@ def acting(policy: Policy, mean: np.ndarray, std: np.ndarray, clip: float) -> Ac
     """The policy for rollouts, as its learner gives it."""
     normalisation = Normalisation.of(mean, std, clip)
     if isinstance(policy.network, CompiledMLP):
-        return CompiledActing.of(policy.network, policy.log_std, policy.parts, normalisation)
+        return CompiledLearner.acting(policy, normalisation)
     return NetworkActing(policy, normalisation)
 
 

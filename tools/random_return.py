@@ -8,35 +8,17 @@ wrappers that config.yaml, and the files CONFIG read over it, set for it.
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from mace_rl.base.rng import Streams
-from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError
+from mace_rl.library import settings
 from mace_rl.training.factories import environment
 from mace_rl.training.rollout import endless
-from mace_study.config.study import load_study
-
-ROOT = Path(__file__).resolve().parent.parent
-
-
-def configuration(name: str, overlays: list[str]) -> RunConfig:
-    """Of a run in an environment, which needs no random return yet; `ConfigError` if none is there.
-
-    The study's own environments and seeds are those of config.yaml, whatever the files over it say.
-    """
-    base = config = read_yaml(ROOT / "config.yaml")
-    for overlay in overlays:
-        config = merge(config, read_yaml(Path(overlay)))
-    origin = " + ".join(["config.yaml", *overlays])
-    own = {"environments": base["environments"], "environment_seeds": {}}
-    study = load_study(config | own, origin)
-    return study.run_config(name, "ppo", 0)
 
 
 def random_returns(config: RunConfig, episodes: int) -> np.ndarray:
@@ -75,7 +57,7 @@ def main() -> None:
     if episodes < 2:
         sys.exit(f"random_return: EPISODES is {episodes}, but should be at least 2")
     try:
-        measured = random_returns(configuration(name, arguments.configs), episodes)
+        measured = random_returns(settings(name, "ppo", config=arguments.configs), episodes)
     except ConfigError as error:
         sys.exit(f"random_return: {error}")
     standard_error = measured.std(ddof=1) / np.sqrt(episodes)

@@ -81,7 +81,7 @@ def _make(name: str) -> tuple[int, list[str]]:
     made = folder, plan.with_episodes, plan.measured
     command = shlex.join(["snakemake", "all", "--configfile", *given])
     papers = plan.read and plan.has_papers
-    pictures = [one for one in (*FIGURES, *plan.pictures) if one != "readings" or papers]
+    pictures = [one for one in plan.pictures if one != "readings" or papers]
     results.measure(frames, plan.measured, folder, FIGURES, plan.paper if papers else None)
     results.tabulate(*made, plan.paper, study.labels)
     results.write_table2(folder, plan.ppo_settings(), plan.paper)

@@ -129,30 +129,22 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
         " ([the protocol](../../worlds/protocol.md#the-table-as-a-draw))."
     )
     sections.append(Section("The paper's numbers", note, frame))
-    rows = [
-        [
-            row.world,
-            "as the words say" if row.rule.split(" / ")[0] != AS_NAMED[0] else "as named",
-            f"{row.unusual} of {row.numbers}",
-            f"{row.limit}",
-            f"{row.chance_unusual:.2g}",
-            f"{row.first}",
-            f"{row.chance_first:.3f}",
-            f"{row.chance_any:.3f}",
-        ]
-        for row in records(tables["draws"])
-    ]
+    rows: list[dict[str, str]] = []
+    for row in records(tables["draws"]):
+        as_words = row.rule.split(" / ")[0] != AS_NAMED[0]
+        rows.append(
+            {
+                "world": row.world,
+                "metrics": "as the words say" if as_words else "as named",
+                "unusual": f"{row.unusual} of {row.numbers}",
+                "unlike from": f"{row.limit}",
+                "chance of as many": f"{row.chance_unusual:.2g}",
+                "columns": f"{row.first}",
+                "as favourable": f"{row.chance_first:.3f}",
+                "by chance": f"{row.chance_any:.3f}",
+            }
+        )
     favoured = look.labels[tables["draws"]["favoured"].iloc[0]]
-    columns = [
-        "world",
-        "metrics",
-        "unusual",
-        "unlike from",
-        "chance of as many",
-        "columns",
-        "as favourable",
-    ]
-    columns.append("by chance")
     note = (
         "One seed of each variant as Table 1. *Chance of as many*: of as many unusual numbers."
         f" *Columns*: in which {favoured} is first in the paper's table, of the world's"
@@ -160,7 +152,7 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
         " that is drawn anew in each environment is. *Metrics*: the protocol's words ask for the"
         " public code's rules, but it names another metric for sample efficiency: here are both."
     )
-    sections.append(Section("The table as a draw", note, pd.DataFrame(rows, columns=columns)))
+    sections.append(Section("The table as a draw", note, pd.DataFrame(rows)))
     return sections
 
 

@@ -17,7 +17,6 @@ from mace_rl.config.run import RunConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.library import settings
 from mace_rl.numerics.arrays import total
-from mace_rl.training.checks import CheckedBeta
 from mace_rl.training.trainer import Trainer
 
 GRID = (0.01, 0.2, 0.99)  # the βs under which a life goes on
@@ -105,7 +104,7 @@ def constant(beta: float, gauge: Gauge) -> float:
 def begin(config: RunConfig, choose: Choice) -> Trainer:
     """A training whose β is chosen so."""
     trainer = Trainer(config)
-    trainer.controller = CheckedBeta(Chosen(config.episodes, choose))
+    trainer.controller = Chosen(config.episodes, choose)
     return trainer
 
 
@@ -118,7 +117,7 @@ def branches(number: int, seed: int, choose: Choice | None, count: int = 2) -> l
     found = []
     with threadpool_limits(1):
         for _ in trainer.run():
-            assert trainer.controller is not None
+            assert isinstance(trainer.controller, Chosen)
             gauge = trainer.controller.gauge
             if points and len(gauge.windows) >= points[0]:
                 points.pop(0)
@@ -135,10 +134,8 @@ def futures(config: RunConfig, trainer: Trainer) -> list[float]:
     for beta in GRID:
         future = begin(config, partial(constant, beta))
         future.load_state_dict(copy.deepcopy(state))
-        assert future.controller is not None
-        chosen = future.controller.part
-        assert isinstance(chosen, Chosen)
-        chosen.now = beta
+        assert isinstance(future.controller, Chosen)
+        future.controller.now = beta
         for _ in future.run():
             pass
         rest = sum(record.extrinsic_return for record in future.records[played:])

@@ -256,7 +256,3 @@ def main() -> None:
     unseen = getattr(getattr(buffer, "raw", None), "error", None)
     if unseen and arguments.command != "train":  # which shows nothing but how far it is
         sys.exit(f"mace-rl: standard output: {unseen.strerror}")
-
-
-if __name__ == "__main__":
-    main()

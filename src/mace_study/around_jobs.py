@@ -8,6 +8,7 @@ import textwrap
 from typing import TextIO
 
 from mace_rl.base import files
+from mace_rl.base.tables import read_made
 from mace_study.plan import Plan
 
 SHOWN = ["figure1.pdf", "figure2.pdf", "table1.tex", "table2.tex", "tables.md", "claims.md"]
@@ -45,16 +46,9 @@ def outcome(plan: Plan, wanted: set[str], asked: set[str], of_all: set[str]) -> 
     made = set(filter(os.path.exists, wanted))
     lines = []
     if f"{plan.results}/table1.csv" in made:
-        import pandas as pd  # only now: it takes as long as planning
+        from mace_study.show import markdown, tables  # only now: it takes as long as planning
 
-        from mace_study.show import markdown, tables
-
-        table1 = pd.read_csv(
-            f"{plan.results}/table1.csv",
-            dtype={"variant": str},
-            keep_default_na=False,
-            na_values=[""],
-        )
+        table1 = read_made(f"{plan.results}/table1.csv")
         named = tables.named(table1, plan.study.labels)
         shown = tables.table1(named, plan.measured, plan.paper.table1)
         lines = [f"\n{title(plan)}\n", markdown.plain(shown), ""]

@@ -105,9 +105,9 @@ class Plan:
 
     @cached_property
     def pictures(self) -> list[str]:
-        """Those that the study has the numbers for, beside `FIGURES`."""
+        """Those that the study has the numbers for."""
         drawn: dict[str, Any] = {
-            "every_seed": True,
+            **dict.fromkeys((*FIGURES, "every_seed"), True),
             "constants": self.measured.constants,
             "solved": self.measured.solved_return,
             "forest": self.judged,

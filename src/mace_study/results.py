@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from mace_rl.base.files import write_atomically
-from mace_rl.base.tables import read_table
+from mace_rl.base.tables import read_made
 from mace_rl.config.agent import PPOConfig
 from mace_rl.training.records import RunKey
 from mace_study.compare import ledger, verdicts
@@ -21,7 +21,7 @@ from mace_study.compare.comparisons import comparisons
 from mace_study.compare.readings import readings
 from mace_study.compare.summary import split, summary
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.betas import betas_columns, betas_table
+from mace_study.measure.betas import betas_table
 from mace_study.measure.metrics_csv import metrics_table, read_metrics
 from mace_study.show import markdown, sections
 from mace_study.show.latex import table1_latex, table2_latex
@@ -93,21 +93,15 @@ def judge(
 
     seconds: that all runs took; command: that makes them.
     """
-    table = read_metrics(folder / "metrics.csv", runs, settings)
-    betas = read_table(folder / "betas.csv", betas_columns(settings))
-    table = table.merge(betas, how="left", on=["env", "variant", "seed"], validate="1:1")
+    data = sections.read_data(folder, ["metrics", "betas"], runs, settings)
+    keys = ["env", "variant", "seed"]
+    table = data["metrics"].merge(data["betas"], how="left", on=keys, validate="1:1")
     answers, hours = verdicts.ledger(table, settings, paper), seconds / 3600
     cost = {"command": command, "runs": len(table), "core_hours": hours}
     write_atomically(folder / "claims.json", ledger.to_json(cost, answers))
     origin = f"`{command}`: {len(table)} runs, {hours:.1f} core-hours."
     page = markdown.page("Does it hold?", origin, sections.of_ledger(answers, paper))
     write_atomically(folder / "claims.md", page)
-
-
-def data_of(folder: Path, names: Iterable[str], judged: bool) -> dict[str, Path]:
-    """The files of data with these names, and the ledger if there is one."""
-    found = {name: folder / f"{name}.csv" for name in names}
-    return found | ({"ledger": folder / "claims.json"} if judged else {})
 
 
 def write_page(
@@ -121,7 +115,8 @@ def write_page(
     judged: bool,
 ) -> None:
     """tables.md: every table on one page, beside `pictures`; names: of its data."""
-    data, answers = sections.read_data(data_of(folder, names, judged), runs, settings)
+    data = sections.read_data(folder, names, runs, settings)
+    answers = ledger.read_ledger(folder / "claims.json") if judged else []
     shown = [*sections.of_ledger(answers, paper), *sections.of_runs(data, paper, settings)]
     origin = f"`{command}`: {len(runs)} runs."
     page = markdown.page("The tables of this study", origin, shown, pictures)
@@ -145,19 +140,20 @@ def draw(
     from mace_study.show import curves, pictures
 
     names = list(names)
-    files = data_of(folder, ["metrics", *{"readings"}.intersection(names)], judged)
-    data, answers = sections.read_data(files, runs, settings)
+    read = ["metrics", *{"readings"}.intersection(names)]
+    data = sections.read_data(folder, read, runs, settings)
+    answers = ledger.read_ledger(folder / "claims.json") if judged else []
     look = curves.plot_style(settings, **style)
     for name in names:
         if name in pictures.PICTURES:
             picture = pictures.PICTURES[name]
             table = picture.data(pictures.Source(data, answers, settings, paper))
-            if name not in files:
+            if name not in read:
                 write_table(folder / f"{name}.csv", table)
             figure = picture.draw(table, look)
         else:
             shown = curves.quantity(name.removeprefix("figure"), settings)
             own = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
-            means, seeds = map(curves.read_curves, own)
+            means, seeds = map(read_made, own)
             figure = curves.draw_figure(means, seeds, shown, look)
         curves.save_figure(figure, *(folder / f"{name}.{kind}" for kind in kinds))

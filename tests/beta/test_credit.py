@@ -148,7 +148,7 @@ def policy_gradient(watched, each: Round, advantages: np.ndarray) -> np.ndarray:
 
 def scaled(item: Experience, kind: str) -> np.ndarray:
     """Advantages of one kind in units of their scale."""
-    return item.evaluations[kind].advantages / item.evaluations[kind].scale
+    return getattr(item, kind).advantages / getattr(item, kind).scale
 
 
 def test_direction_is_how_the_update_moves_with_beta(watched):

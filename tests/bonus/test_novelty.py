@@ -158,7 +158,7 @@ def test_all_is_brought_up_to_date_at_the_first_end_of_an_episode_after_so_many_
     episodes = [cluster(length, seed=length) for length in (20, 21, 19, 49, 1, 120, 10)]
     refreshed = steps = 0
     for states, due in zip(episodes, (0, 0, 1, 0, 1, 1, 0), strict=True):
-        before, weights = novelty(probes), novelty.density.network.parameters.copy()
+        before, weights = novelty(probes), novelty.density.parameters.copy()
         observe(novelty, states)
         steps += len(states)
         refreshed = steps if due else refreshed
@@ -166,7 +166,7 @@ def test_all_is_brought_up_to_date_at_the_first_end_of_an_episode_after_so_many_
         written = math.ceil(refreshed / write_every)
         assert novelty.visited.tolist() == taken[:written].tolist()
         assert novelty.pending.tolist() == taken[written:].tolist()
-        for same in (novelty(probes) == before, novelty.density.network.parameters == weights):
+        for same in (novelty(probes) == before, novelty.density.parameters == weights):
             assert same.all() != bool(due)
 
 
@@ -204,14 +204,14 @@ def test_states_that_repeat_exactly_are_known(cells):
 def arbitrary(size, hidden_units) -> DensityEstimator:
     generator = np.random.default_rng(0)
     model = DensityEstimator(size, hidden_units, generator)
-    parameters = model.network.parameters
+    parameters = model.parameters
     parameters[:] = 0.5 * generator.standard_normal(len(parameters)) * free(model)
     return model
 
 
 def free(model: DensityEstimator) -> np.ndarray:
     """Which parameters are neither masked nor zeros added to the layout."""
-    return model.network.mask * Twin(model.network).own()
+    return model.mask * Twin(model).own()
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 15])
@@ -219,10 +219,10 @@ def test_conditional_of_each_coordinate_depends_on_earlier_ones_only(size):
     """To the bit: its μ and σ change with those, and with no other."""
     model = arbitrary(size, hidden_units=32)
     x = np.random.default_rng(1).standard_normal((1, size)).astype(np.float32)
-    before = model.network.forward(x).outputs[0]
+    before = model.forward(x).outputs[0]
     for j in range(size):
         changed = x + np.float32(0.5) * (np.arange(size) == j)
-        same = model.network.forward(changed).outputs[0] == before
+        same = model.forward(changed).outputs[0] == before
         assert same.tolist() == [i <= j for i in range(size)] * 2
 
 
@@ -234,10 +234,10 @@ def test_log_density_and_gradient_equal_autograd(size, narrow):
     Of the first coordinate log σ is the bias alone; if `narrow`, below its bound.
     """
     model = arbitrary(size, hidden_units=8)
-    _, biases = model.network.layers(model.network.parameters)[-1]  # of μ, then log σ
+    _, biases = model.layers(model.parameters)[-1]  # of μ, then log σ
     biases[size] = -5.5 if narrow else -1.0
     x = np.random.default_rng(1).standard_normal((200, size)).astype(np.float32)
-    twin = Twin(model.network)
+    twin = Twin(model)
     outputs = twin(x)
     normal = torch.distributions.Normal(outputs[:, :size], outputs[:, size:].clamp(min=-5).exp())
     expected = normal.log_prob(torch.from_numpy(x)).sum(dim=1)

@@ -14,6 +14,7 @@ from snakemake.exceptions import WorkflowError
 from snakemake.utils import validate
 
 from mace_rl.config.reading import read_options, read_yaml
+from mace_rl.library import settings
 from mace_rl.runs import run
 from mace_study.config.study import read_study
 from tools import kept_runs, random_return, schema, tables, worlds
@@ -144,7 +145,7 @@ def test_a_random_return_has_the_study_s_wrappers(tmp_path) -> None:
     own = wrapper.replace("TransformReward", "ClipReward").replace("func: null", "max_reward: 0.5")
     over.write_text(f"environment_settings: {{CartPole-v1: {{environment_wrappers: [{own}]}}}}")
     lengths, halves = (
-        random_return.random_returns(random_return.configuration("CartPole-v1", files), 20)
+        random_return.random_returns(settings("CartPole-v1", "ppo", config=files), 20)
         for files in ([], [str(over)])
     )
     assert (halves == lengths / 2).all()

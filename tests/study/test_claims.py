@@ -126,9 +126,9 @@ def test_all_parts_are_corrected_together_and_have_their_margins(small) -> None:
 
 def test_a_reading_is_of_the_metric_with_the_longest_name_that_it_begins_with() -> None:
     rows = {"Own-v0": {key: [100, 900] for key in PAPERS.table1.variants}}
-    own = {"metrics": ["convergence_steps", "convergence_steps_range"], "values": rows}
+    own = {"metrics": ["convergence_steps", "convergence_steps_own"], "values": rows}
     table1 = PAPERS.table1.model_copy(update=own)
-    for reading, expected in (("convergence_steps_range_2", {900}), ("convergence_steps_r", {100})):
+    for reading, expected in (("convergence_steps_own_2", {900}), ("convergence_steps_o", {100})):
         assert {*table1.values_of(["Own-v0"], reading).values()} == expected
     assert table1.values_of(["Own-v0"], "convergence") == {}
 

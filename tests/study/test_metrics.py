@@ -23,13 +23,12 @@ NEGATIVE = [-500, -200, *[-85] * 18]  # 75 % of -85 is -63.75
 # (m_t - m_{t-2}) / 2 of .5, 2.25, 4, 2.25, 0, -.75, -.25 (t = 4, …).
 PEAK = [0, 0, 1, 1, 9, 9, 10, 8, 8, 9]
 COLLAPSE = [*ramp(0, 300, 300), *[0] * 50, *[300] * 600]
-DIP = [0] * 20 + [100] * 50 + [0] * 10 + [100] * 100
 LATE = [0] * 30 + [100] * 70  # window 10: 8 of 10 episodes at 100 are above 75
 WORSE = [0] * 20 + [60] * 80
 SMALL, WIDE = {"random": 0, "moving_average": 2}, {"moving_average": 10}
 BAR = {"random": 0, "goals": (100.0,)} | WIDE
 # From -500 to -100 with random -500: the bar is -200. Window 10: the average of k episodes at -100
-# and 10 - k at -500 is -500 + 40 k, so 8 of them reach it; within 40 of the end are 9 of 10.
+# and 10 - k at -500 is -500 + 40 k, so 8 of them reach it.
 RISE = ([-500] * 30 + [-100] * 70, {"random": -500} | WIDE)
 
 CASES = [  # metric, returns, the curve's settings, episode, censored
@@ -46,14 +45,9 @@ CASES = [  # metric, returns, the curve's settings, episode, censored
     (m.convergence_steps, np.ones(300), {"random": 0}, 100, False),  # there from the beginning
     (m.convergence_steps, PEAK, SMALL, 8, False),  # 75 % of the final 9 is reached at t = 6
     (m.convergence_steps, PEAK, SMALL | {"convergence_slope": 0.6}, 7, False),  # 2.25 ≤ 0.6 · 4
-    (m.convergence_steps_steepest, [0, 0, 1, 1, 1, 1, 2, 2, 2, 2], SMALL, 6, False),  # the first
-    (m.convergence_steps_steepest, COLLAPSE, {}, 750, False),  # moved by a late collapse
-    (m.convergence_steps_steepest, np.arange(99), {}, 99, True),  # two windows short
     (m.convergence_steps_public_code, np.ones(2000), {}, 586, False),  # its floor
     (m.convergence_steps_public_code, np.ones(60), {}, 60, True),
     (m.sample_efficiency_range, *RISE, 38, False),
-    (m.convergence_steps_range, *RISE, 39, False),
-    (m.convergence_steps_range, DIP, {"final": 100, "random": 0} | WIDE, 89, False),
     (m.sample_efficiency_range, [*[0] * 20, 100, *[0] * 29, *[100] * 50], BAR, 58, False),
     (m.sample_efficiency_range, WORSE, BAR, 28, False),  # a bar that falls with the end
     (m.sample_efficiency_common, LATE, BAR, 38, False),
@@ -82,13 +76,8 @@ def test_every_reading_against_loops(seed):
         found = next(iter(episodes), None)
         return found or 400, found is None
 
-    steepest = max(slopes, key=lambda t: (slopes[t], -t))
-    near = [t for t in average if abs(average[t] - final) <= 0.1 * (final - random)]
     expected = {
         m.sample_efficiency_range: first(t for t in average if average[t] >= bar),
-        m.convergence_steps_range: first(t for t in near if set(range(t, 401)) <= set(near)),
-        m.convergence_steps_steepest: first(t for t in slopes if t >= steepest and slopes[t] <= 0),
-        m.convergence_steps_flattest: (min(slopes, key=lambda t: (abs(slopes[t]), t)), False),
         m.convergence_steps: first(
             t
             for t in slopes
@@ -115,7 +104,6 @@ def test_the_last_part_is_rounded_up_in_decimal(fraction):
 
 
 READINGS = [m.sample_efficiency, m.sample_efficiency_range, m.convergence_steps]
-READINGS += [m.convergence_steps_range, m.convergence_steps_steepest, m.convergence_steps_flattest]
 
 
 @pytest.mark.parametrize("metric", READINGS)
@@ -140,7 +128,7 @@ def test_moving_averages_of_equal_windows_are_equal_to_the_bit():
 
 
 @pytest.mark.parametrize(
-    ("episodes", "count"), [(20, 7), (49, 7), (50, 4), (99, 4), (101, 1), (120, 1), (121, 0)]
+    ("episodes", "count"), [(20, 4), (49, 4), (50, 2), (99, 2), (101, 1), (120, 1), (121, 0)]
 )
 def test_what_a_short_training_cannot_reach_is_known_before(episodes, count):
     """Not even one that is good from the beginning, or once it has risen."""

@@ -28,9 +28,6 @@ ROW = {  # of metrics.csv, for 200 episodes of return 20 and 800 of 500
     "solved": 1.0,
     "sample_efficiency_common": 230,  # 22.1 + 0.75 · 377.9 = 305.5: 30 of 50 episodes at 500
     "sample_efficiency_range": 238,  # 22.1 + 0.75 · 477.9 = 380.5: 38 of 50 episodes at 500
-    "convergence_steps_range": 246,  # 500 - 47.79: 46 of 50
-    "convergence_steps_steepest": 300,  # both windows of 50 at 500: episodes 201 to 300
-    "convergence_steps_flattest": 100,
     "convergence_steps_public_code": 286,  # its floor: int(0.3 · 951) + 1
     "sample_efficiency_public_code": 201,
 }

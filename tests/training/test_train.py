@@ -80,7 +80,7 @@ def test_each_reward_has_its_own_returns_and_critic(run_config, scaled):
             scale = trainer.ppo.reward_scales[kind].value if scaled else 1.0
             assert (abs(scale - 1) > 0.1) == scaled
             values = critics[kind](item.observations)[:, 0].detach().numpy()
-            found = item.evaluations[kind].returns, item.evaluations[kind].advantages
+            found = getattr(item, kind).returns, getattr(item, kind).advantages
             returns = ahead @ rewards
             np.testing.assert_allclose(found[0], returns / scale, rtol=1e-5)
             np.testing.assert_allclose(found[1], returns / scale - values, rtol=1e-4, atol=1e-5)
@@ -200,7 +200,7 @@ def test_diagnostics_say_what_an_update_did(run_config, monkeypatch, environment
         squares = np.square(own).sum(), np.square(weighted).sum()
         expected["bonus_share"] = squares[1] / sum(squares)
         for kind, critic in critics[number].items():
-            returns = np.concatenate([item.evaluations[kind].returns for item in rollout])
+            returns = np.concatenate([getattr(item, kind).returns for item in rollout])
             errors = returns - critic(observations)[:, 0].detach().numpy()
             expected[f"explained_variance_{kind}"] = 1 - np.var(errors) / np.var(returns)
         if variant != "ppo":

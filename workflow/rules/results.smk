@@ -51,7 +51,7 @@ rule tables:
         ppo=plan.ppo_settings(),
         judged=plan.judged,
         tabulated=plan.tabulated,
-        pictures=[*FIGURES, *plan.pictures],
+        pictures=plan.pictures,
         command=COMMAND,
         code=code("tables.py", plan.measured),
     script:
@@ -66,14 +66,13 @@ rule pictures:
         ledger=rules.tables.output.json,
         claims=plan.claims,
     output:
-        data=[f"{RESULTS}/{name}.csv" for name in plan.pictures if name != "readings"],
-        pdf=[f"{RESULTS}/{name}.pdf" for name in (*FIGURES, *plan.pictures)],
-        figures=[shown(f"{name}.png", name) for name in FIGURES],
-        png=[shown(f"{name}.png", "picture") for name in plan.pictures],
+        data=[f"{RESULTS}/{name}.csv" for name in plan.pictures if name not in MEASURED],
+        pdf=[f"{RESULTS}/{name}.pdf" for name in plan.pictures],
+        png=[shown(f"{name}.png", name) for name in plan.pictures],
     log:
         f"{RESULTS}/logs/pictures.log",
     params:
-        names=[*FIGURES, *plan.pictures],
+        names=plan.pictures,
         runs=plan.with_episodes,
         settings=plan.measured.model_dump(),
         style=plan.style,

@@ -45,8 +45,8 @@ RESULTS = plan.results
 RUN = f"{RESULTS}/runs/{{env}}/{{variant}}/seed{{seed}}"
 FOLDERS = {files.folder_of(env): env for env in study.environments}
 RECORDS = [f"{run}/{files.RECORD}" for run in plan.folders]
-# Of the data in tables.md, what is measured on runs and not computed of that.
-MEASURED = ("metrics", "betas", "readings")
+# Of the data of tables and pictures, what is measured on runs and not computed of that.
+MEASURED = ("metrics", "betas", "readings", *FIGURES)
 
 
 # How the study is carried out, for what tells where it comes from. Where its results are is no part.

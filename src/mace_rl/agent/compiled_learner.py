@@ -48,7 +48,8 @@ class CompiledLearner(Stateful):
     @staticmethod
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
         network = cast(CompiledMLP, policy.network)
-        return CompiledActing.of(network, policy.log_std, policy.parts, normalisation)
+        of_network = network.parameters, network.sizes, policy.log_std, policy.parts
+        return CompiledActing(normalisation, *of_network, *network.scratch)
 
     def update(
         self, batch: Batch, returns: Mapping[str, np.ndarray], minibatches: Minibatches

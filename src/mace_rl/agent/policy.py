@@ -13,7 +13,7 @@ from mace_rl.agent.distribution import (
 )
 from mace_rl.environments.actions import Actions
 from mace_rl.numerics.compiling import kernel
-from mace_rl.numerics.network import CompiledMLP, Network
+from mace_rl.numerics.network import Network
 from mace_rl.numerics.network_kernels import forward
 from mace_rl.numerics.normaliser import Normalisation, normalise
 
@@ -86,28 +86,8 @@ class CompiledActing(NamedTuple):
     sizes: np.ndarray  # int64 [layers + 1]
     log_std: np.ndarray  # float32 [actions]; empty unless they are Box ones
     parts: np.ndarray  # int64 [parts]; empty unless they have several
-    seen: np.ndarray  # scratch memory of `means_or_logits`, like the next
+    seen: np.ndarray  # the network's scratch memory, like the next
     activations: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        network: CompiledMLP,
-        log_std: np.ndarray,
-        parts: np.ndarray,
-        normalisation: Normalisation,
-    ) -> "CompiledActing":
-        """With this network."""
-        seen, activations = network.scratch
-        return cls(
-            normalisation=normalisation,
-            parameters=network.parameters,
-            sizes=network.sizes,
-            log_std=log_std,
-            parts=parts,
-            seen=seen,
-            activations=activations,
-        )
 
     def act(self, observation: np.ndarray, noise: float | np.ndarray) -> tuple[Action, np.float32]:
         sample = act_box if len(self.log_std) else act_parts if len(self.parts) else act_discrete

@@ -13,7 +13,7 @@ from mace_rl.agent.policy import ActingPolicy, Policy
 from mace_rl.agent.scale import AdvantageScale, RewardScale
 from mace_rl.base.state import Stateful
 from mace_rl.config.agent import PPOConfig
-from mace_rl.numerics.arrays import in_order, shuffled
+from mace_rl.numerics.arrays import shuffled
 from mace_rl.numerics.finite import require_finite
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation, RunningNormaliser
@@ -124,5 +124,6 @@ class PPO(ActorCritic, Stateful):
         # Of equal size: a last one of two steps would change as much as one of 128.
         parts = math.ceil(count / size)
         ends = np.arange(1, parts + 1) * count // parts
-        epochs = shuffled(self.generator.random(shape)) if parts > 1 else in_order(*shape)
-        return Minibatches(epochs, ends)
+        if parts > 1:
+            return Minibatches(shuffled(self.generator.random(shape)), ends)
+        return Minibatches(np.tile(np.arange(count), (self.config.epochs, 1)), ends)

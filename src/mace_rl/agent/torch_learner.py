@@ -13,7 +13,7 @@ from mace_rl.agent.policy import ActingPolicy, NetworkActing, Policy
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.base.state import Stateful
 from mace_rl.config.agent import PPOConfig
-from mace_rl.numerics.adam import EPSILON
+from mace_rl.numerics.adam import DECAY_SQUARE, EPSILON
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.normaliser import Normalisation
 
@@ -29,9 +29,9 @@ class TorchLearner(Stateful):
         self.actor = TorchPolicy(policy, validate=False)  # NaN is found in the gradients' norms
         if self.actor.continuous and not config.learn_log_std:
             self.actor.log_std.register_hook(torch.zeros_like)
-        self.policy_gradients = self.actor.gradients
         self.critics = {kind: critic.module() for kind, critic in critics.items()}
-        self.weights = {"actor": self.actor.weights()}
+        log_std = [self.actor.log_std] if self.actor.continuous else []
+        self.weights = {"actor": [*self.actor.network.parameters(), *log_std]}  # as a `Policy` has
         self.weights |= {kind: list(critic.parameters()) for kind, critic in self.critics.items()}
         rates = dict.fromkeys(critics, config.critic_learning_rate)
         rates["actor"] = config.actor_learning_rate
@@ -74,5 +74,28 @@ class TorchLearner(Stateful):
     def acting(policy: Policy, normalisation: Normalisation) -> ActingPolicy:
         return NetworkActing(policy, normalisation)
 
+    def policy_gradients(
+        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        log_probs = self.actor(from_numpy(observations)).log_prob(from_numpy(actions))
+        gradients = []
+        for item in advantages:
+            mean = (log_probs * from_numpy(item.astype(np.float32))).mean()
+            parts = torch.autograd.grad(
+                mean, self.weights["actor"], retain_graph=True, materialize_grads=True
+            )
+            gradients.append(torch.cat([part.ravel() for part in parts]).numpy())
+        return gradients
+
     def preconditioned(self, direction: np.ndarray) -> np.ndarray:
-        return self.actor.preconditioned(direction, self.optimiser)
+        """As `Learner` says. `direction` is 0 for weights that have had no gradient."""
+        states = [self.optimiser.state.get(part) or None for part in self.weights["actor"]]
+        if not any(states):
+            return direction
+        units = [
+            torch.ones_like(part)
+            if state is None
+            else (state["exp_avg_sq"] / (1 - DECAY_SQUARE ** state["step"])).sqrt() + EPSILON
+            for part, state in zip(self.weights["actor"], states, strict=True)
+        ]
+        return direction / torch.cat([part.detach().ravel() for part in units]).numpy()

@@ -2,14 +2,12 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, from_numpy
 from torch.distributions import Categorical, Distribution, Independent, Normal
 from torch.distributions.constraints import dependent
 
 from mace_rl.agent.policy import Policy
-from mace_rl.numerics.adam import DECAY_SQUARE, EPSILON
 
 
 class Categoricals(Distribution):
@@ -64,33 +62,3 @@ class TorchPolicy(torch.nn.Module):
             return Categoricals(outputs, self.parts, self.validate)
         normal = Normal(outputs, self.log_std.exp(), validate_args=self.validate)
         return Independent(normal, 1, validate_args=self.validate)
-
-    def gradients(
-        self, observations: np.ndarray, actions: np.ndarray, advantages: list[np.ndarray]
-    ) -> list[np.ndarray]:
-        log_probs = self(from_numpy(observations)).log_prob(from_numpy(actions))
-        gradients = []
-        for item in advantages:
-            mean = (log_probs * from_numpy(item.astype(np.float32))).mean()
-            parts = torch.autograd.grad(
-                mean, self.weights(), retain_graph=True, materialize_grads=True
-            )
-            gradients.append(torch.cat([part.ravel() for part in parts]).numpy())
-        return gradients
-
-    def weights(self) -> list[Tensor]:
-        """Its parameters, in the order of `Policy.parameters`."""
-        return [*self.network.parameters(), *([self.log_std] if self.continuous else [])]
-
-    def preconditioned(self, direction: np.ndarray, adam: torch.optim.Adam) -> np.ndarray:
-        """As `Learner` says. `direction` is 0 for weights that have had no gradient."""
-        states = [adam.state.get(part) or None for part in self.weights()]
-        if not any(states):
-            return direction
-        units = [
-            torch.ones_like(part)
-            if state is None
-            else (state["exp_avg_sq"] / (1 - DECAY_SQUARE ** state["step"])).sqrt() + EPSILON
-            for part, state in zip(self.weights(), states, strict=True)
-        ]
-        return direction / torch.cat([part.detach().ravel() for part in units]).numpy()

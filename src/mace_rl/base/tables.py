@@ -13,11 +13,23 @@ from mace_rl.base.errors import Refusal
 if TYPE_CHECKING:  # training only writes, without pandas
     import pandas as pd
 
+TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
 _BOUND = {int: 2**53, float: np.inf}  # below which an int is exact as a double
 
 
 class RecordError(Refusal, ValueError):
     """A result file that cannot be trusted; the message names the file and the line."""
+
+
+def read_made(path: str | Path) -> "pd.DataFrame":
+    """What a study made, to the bit (pandas 3.1.0 and later): names as they were given, NA and 0.1.
+
+    An empty cell is NaN. Of a table that people may edit or break, `read_table` judges each cell.
+    """
+    import pandas as pd
+
+    how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
+    return pd.read_csv(path, **how)
 
 
 def read_table(path: str | Path, columns: Mapping[str, type]) -> "pd.DataFrame":

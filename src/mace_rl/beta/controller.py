@@ -1,10 +1,11 @@
 """The interface of whatever sets β."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from mace_rl.base.state import HasState
 from mace_rl.environments.episode import Episode
 
 
@@ -15,7 +16,7 @@ class BetaGradient(NamedTuple):
     advantage_rms: float  # of what β weighs: the rollout's intrinsic advantages, in their scale
 
 
-class BetaController(ABC):
+class BetaController(HasState):
     """Sets β for the next episode from what happened in the last.
 
     One of the user's own is made as Class(generator, **arguments); it raises `ConfigError` for
@@ -51,11 +52,3 @@ class BetaController(ABC):
         judged with this, or None.
         """
         raise NotImplementedError("this rule for β does not learn")
-
-    @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that `load_state_dict` needs: tensors, numbers, strings, lists, dicts."""
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""

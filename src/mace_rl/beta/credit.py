@@ -97,13 +97,11 @@ class Credit(Objective):
         self.judged: deque[tuple[list[np.ndarray], float]] = deque()
 
     def after_episode(self, played: Played) -> None:
-        """See `Objective`."""
         self.played.append((played.sequence, played.output))
 
     def after_rollout(
         self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
     ) -> tuple[float | None, Lesson | None]:
-        """See `Objective`."""
         credit = self.judge.judge(gradient, advantage_rms, change)
         chosen = evenly(self.played, self.most)
         mean_output = sum(output for _, output in chosen) / max(len(chosen), 1)
@@ -145,7 +143,6 @@ class Evidence(Credit):
         return min(max(output / math.sqrt(self.size / self.weight), -1.0), 1.0)
 
     def credited(self, credit: float, output: float) -> None:
-        """See `Credit`."""
         term = credit * self.unit(output)
         self.sum += term
         self.variance += term**2
@@ -164,5 +161,4 @@ class Evidence(Credit):
         return max(self.sum / math.sqrt(known) - math.sqrt(bound), 0.0)
 
     def logit(self, output: float) -> float:
-        """See `Objective`."""
         return self.config.gain * self.beyond_chance * self.unit(output)

@@ -46,7 +46,6 @@ class MetaAdaptation(Stateful, BetaController):
         self.asked: tuple[np.ndarray, float, float] | None = None  # what was read, o and β
 
     def next_beta(self) -> float:
-        """See `BetaController`."""
         self.asked = None
         if self.sequence is None:  # the first episode's β is given
             return beta_of(self.initial_logit)
@@ -56,7 +55,6 @@ class MetaAdaptation(Stateful, BetaController):
         return beta
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:
-        """See `BetaController`."""
         if self.asked is not None:
             played = Played(*self.asked, total(episode.rewards))
             self.take(self.objective.after_episode(played))
@@ -65,7 +63,6 @@ class MetaAdaptation(Stateful, BetaController):
     def learn(
         self, gradient: np.ndarray, advantage_rms: float, change: BetaGradient
     ) -> float | None:
-        """See `BetaController`."""
         credit, lesson = self.objective.after_rollout(gradient, advantage_rms, change)
         self.take(lesson)
         return credit

@@ -10,6 +10,7 @@ are in `beta.credit`.
 import math
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,14 +76,19 @@ def mean(values: Any) -> float:
     return sum(values) / len(values)
 
 
-def deviation(values: Any, centre: float) -> float:
-    """The root mean square distance of values from `centre`."""
-    return math.sqrt(mean([(value - centre) ** 2 for value in values]))
+def deviation(values: Collection[float], centre: float) -> float:
+    """The root mean square distance of values from `centre`; 0 of none."""
+    return math.sqrt(mean([(value - centre) ** 2 for value in values])) if values else 0.0
 
 
-def in_units(payment: float, usual: float) -> float:
-    """`payment` in units of its usual size, within ±`LARGEST`; 0 while that is 0."""
-    return min(max(payment / usual, -LARGEST), LARGEST) if usual > 0 else 0.0
+def in_units(value: float, before: Collection[float], centred: bool) -> float:
+    """`value` in units of the usual size of those before, within ±`LARGEST`; 0 while that is 0.
+
+    centred: both are less the mean of those before.
+    """
+    centre = mean(before) if centred and before else 0.0
+    usual = deviation(before, centre)
+    return min(max((value - centre) / usual, -LARGEST), LARGEST) if usual > 0 else 0.0
 
 
 class Return(Objective):
@@ -100,11 +106,7 @@ class Return(Objective):
         self.returns: deque[float] = deque(maxlen=config.recent)
 
     def after_episode(self, played: Played) -> Lesson | None:
-        """See `Objective`."""
-        paid = 0.0
-        if self.returns:
-            centre = mean(self.returns) if self.centred else 0.0
-            paid = in_units(played.extrinsic_return - centre, deviation(self.returns, centre))
+        paid = in_units(played.extrinsic_return, self.returns, self.centred)
         self.returns.append(played.extrinsic_return)
         return Lesson([played.sequence], -paid * played.beta * (1 - played.beta))
 
@@ -132,11 +134,9 @@ class Perturbed(Objective):
         return self.config.noise if self.generator.random() < 0.5 else -self.config.noise
 
     def logit(self, output: float) -> float:
-        """See `Objective`."""
         return output + self.perturbation
 
     def after_episode(self, played: Played) -> Lesson | None:
-        """See `Objective`."""
         before, slope = self.sequence, -self.paid(played.extrinsic_return) * self.trace
         self.sequence = played.sequence
         self.trace += (self.perturbation / self.config.noise - self.trace) / self.config.lag
@@ -166,11 +166,7 @@ class Score(Perturbed):
         self.returns: deque[float] = deque(maxlen=config.recent)
 
     def paid(self, extrinsic_return: float) -> float:
-        """See `Perturbed`."""
-        result = 0.0
-        if self.returns:
-            centre = mean(self.returns)
-            result = in_units(extrinsic_return - centre, deviation(self.returns, centre))
+        result = in_units(extrinsic_return, self.returns, centred=True)
         self.returns.append(extrinsic_return)
         return result
 
@@ -191,12 +187,11 @@ class Progress(Perturbed):
         self.rises: deque[float] = deque(maxlen=config.recent)
 
     def paid(self, extrinsic_return: float) -> float:
-        """See `Perturbed`."""
         self.returns.append(extrinsic_return)
         if len(self.returns) < 2 * self.stretch:
             return 0.0
         rise = difference(self.returns)
-        result = in_units(rise, deviation(self.rises, 0.0)) if self.rises else 0.0
+        result = in_units(rise, self.rises, centred=False)
         self.rises.append(rise)
         return result
 
@@ -216,7 +211,6 @@ class Words(Objective):
         self.returns: deque[float] = deque(maxlen=2 * config.stretch)
 
     def after_episode(self, played: Played) -> Lesson | None:
-        """See `Objective`."""
         self.returns.append(played.extrinsic_return)
         if len(self.returns) < 2 * self.stretch:
             return None

@@ -133,7 +133,6 @@ class Curiosity(Stateful, IntrinsicReward):
         memory.write(before[chosen], after[chosen], episode.rewards[chosen], returns[chosen])
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
         super().load_state_dict(state)
         self._build_index()
 

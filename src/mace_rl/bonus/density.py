@@ -4,57 +4,38 @@ import numpy as np
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import HALF_LOG_TAU, exp
-from mace_rl.numerics.network import CompiledMLP, Layers, Trace, mlp
+from mace_rl.numerics.network import CompiledMLP, mlp
 
 SMALLEST_LOG_STD = -5.0  # a coordinate that never varies would otherwise have infinite density
 
 
-def masked_layers(
-    size: int, hidden_units: int, generator: np.random.Generator
-) -> tuple[Layers, tuple[np.ndarray, np.ndarray]]:
-    """New layers of a masked autoencoder, and the masks of their weights, [in, out] each.
+class DensityEstimator(CompiledMLP):
+    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)): p integrates to 1 whatever the weights.
 
-    It maps [N, size] to [N, 2 size]: μ_i and log σ_i, functions of the inputs before the i-th, with
-    one hidden layer and tanh. Masked weights start at 0, and their gradient is 0.
+    The network, [N, size] → [N, 2 size], has one hidden layer and tanh; its outputs are μ, then
+    log σ. Masked weights start at 0, and their gradient is 0.
     """
-    # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
-    degrees = np.arange(hidden_units) % max(size - 1, 1) + 1
-    coordinates = np.arange(1, size + 1)
-    inward = (coordinates[:, None] <= degrees).astype(np.float32)
-    outward = np.tile(degrees[:, None] < coordinates, 2).astype(np.float32)
-    hidden, output = mlp([size, hidden_units, 2 * size], 0.1, generator)
-    layers = [(hidden[0] * inward, hidden[1]), (output[0] * outward, output[1])]
-    return layers, (inward, outward)
-
-
-class CompiledAutoencoder(CompiledMLP):
-    """`torch_density.MaskedAutoencoder` in compiled code."""
 
     def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
-        layers, masks = masked_layers(size, hidden_units, generator)
-        super().__init__(layers)
+        # Unit h sees inputs up to its degree; outputs of coordinate i see units of lower degree.
+        degrees = np.arange(hidden_units) % max(size - 1, 1) + 1
+        coordinates = np.arange(1, size + 1)
+        inward = (coordinates[:, None] <= degrees).astype(np.float32)
+        outward = np.tile(degrees[:, None] < coordinates, 2).astype(np.float32)
+        hidden, output = mlp([size, hidden_units, 2 * size], 0.1, generator)
+        super().__init__([(hidden[0] * inward, hidden[1]), (output[0] * outward, output[1])])
         self.mask = np.ones_like(self.parameters)
-        for (weights, _), mask in zip(self.layers(self.mask), masks, strict=True):
+        for (weights, _), mask in zip(self.layers(self.mask), (inward, outward), strict=True):
             weights[:] = mask
-
-    def backward(self, trace: Trace, grad_outputs: np.ndarray) -> np.ndarray:
-        return super().backward(trace, grad_outputs) * self.mask
-
-
-class DensityEstimator:
-    """log p(x) = Σ_i log N(x_i; μ_i(x_<i), σ_i(x_<i)): p integrates to 1 whatever the weights."""
-
-    def __init__(self, size: int, hidden_units: int, generator: np.random.Generator) -> None:
-        self.network = CompiledAutoencoder(size, hidden_units, generator)
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Log-density of each row of x, float32 [N, size] → [N]."""
-        return gaussian_log_probs(x, self.network.forward(x).outputs)
+        return gaussian_log_probs(x, self.forward(x).outputs)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """∇ of the mean log-density of the rows of x, [N, size], with respect to the parameters."""
-        trace = self.network.forward(x)
-        return self.network.backward(trace, gaussian_grad(x, trace.outputs))
+        trace = self.forward(x)
+        return self.backward(trace, gaussian_grad(x, trace.outputs)) * self.mask
 
 
 @kernel

@@ -76,7 +76,7 @@ class DensityNovelty(Stateful, Novelty):
         self.refreshed = 0  # value of `steps` at the last refresh
         self.pending = np.empty((0, size), np.float32)  # states to write at the next one
         self.density = DensityEstimator(size, config.density_hidden_units, streams["density"])
-        self.optimiser = Adam(self.density.network.parameters, config.density_learning_rate)
+        self.optimiser = Adam(self.density.parameters, config.density_learning_rate)
         self.batches = streams["density_batches"]
         self.distance_thresholds = np.zeros(len(config.neighbours))  # d*
         self.log_density_threshold = 0.0  # l*

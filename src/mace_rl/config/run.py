@@ -20,9 +20,7 @@ from mace_rl.config.section import Arguments, Reference, Section, short_repr
 
 # What identifies a run; every other key of RunConfig is a setting.
 IDENTITY = ("environment", "variant", "seed")
-BONUS_SECTIONS = ("bonus", "memory", "novelty")  # used only by variants with a bonus
-# Used only where beta.kind is one of these.
-BETA_SECTIONS = {"meta": ("meta",)}
+SECTIONS = ("bonus", "memory", "novelty", "meta")  # used only by variants with a bonus
 
 
 def _of_the_constructor(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -141,7 +139,7 @@ class RunConfig(AgentConfig):
     def _all_that_is_used(self) -> "RunConfig":
         if isinstance(self.beta, MetaBeta) and not self.beta.objective and not self.trainer:
             raise ValueError("beta.objective is missing: what the meta network learns from")
-        for section in {*BONUS_SECTIONS, *BETA_SECTIONS} - set(unused_sections(self)):
+        for section in {*SECTIONS} - set(unused_sections(self)):
             if getattr(self, section) is None:
                 raise ValueError(f"the section {section!r} is missing")
         return self
@@ -175,12 +173,11 @@ def unused_sections(settings: Any) -> dict[str, str]:
         return found
 
     if value("trainer") == "published":
-        return dict.fromkeys((*BONUS_SECTIONS, *BETA_SECTIONS), "trainer 'published'")
+        return dict.fromkeys(SECTIONS, "trainer 'published'")
     beta, bonus = value("beta", "kind"), value("bonus", "kind")
     if beta == "none":
-        return dict.fromkeys((*BONUS_SECTIONS, *BETA_SECTIONS), "beta.kind 'none'")
-    others = [section for section, kinds in BETA_SECTIONS.items() if beta and beta not in kinds]
-    unused = dict.fromkeys(others, f"beta.kind {beta!r}")
+        return dict.fromkeys(SECTIONS, "beta.kind 'none'")
+    unused = {"meta": f"beta.kind {beta!r}"} if beta and beta != "meta" else {}
     if value("bonus", "relevance") is False:
         unused["memory"] = "bonus.relevance false"
     if bonus == "custom":

@@ -42,7 +42,7 @@ def restore(env: Env, state: dict[str, Any]) -> None:
 
 def hold_still(env: Env) -> None:
     """Let Gymnasium's normalising wrappers learn no more."""
-    for layer in _layers(env):
+    for layer in layers(env):
         if hasattr(type(layer), "update_running_mean"):
             layer.update_running_mean = False
 
@@ -50,7 +50,7 @@ def hold_still(env: Env) -> None:
 def fractions(env: Env) -> dict[str, bytes]:
     """The fractions that wrappers of others hold, by attribute: no `remembered` has them."""
     found = {}
-    for number, layer in enumerate(_layers(env)):
+    for number, layer in enumerate(layers(env)):
         known = type(layer).__module__.startswith(GYMNASIUMS) or hasattr(type(layer), OFFERED[0])
         for name, value in {} if known else vars(layer).items():
             inside = vars(value).items() if hasattr(value, "__dict__") and name != "env" else ()
@@ -64,7 +64,7 @@ def fractions(env: Env) -> dict[str, bytes]:
     return found
 
 
-def _layers(env: Env) -> Iterator[Any]:
+def layers(env: Env) -> Iterator[Any]:
     """The wrappers, the outermost first."""
     layer: Any = env
     while layer is not layer.unwrapped:
@@ -74,7 +74,7 @@ def _layers(env: Env) -> Iterator[Any]:
 
 def _statistics(env: Env) -> Iterator[tuple[str, Any, str]]:
     """Key, holder and name of each number or array that Gymnasium's wrappers learn."""
-    for number, layer in enumerate(_layers(env)):
+    for number, layer in enumerate(layers(env)):
         for name, value in vars(layer).items():
             if isinstance(value, RunningMeanStd):
                 for part in ("mean", "var", "count"):

@@ -79,7 +79,7 @@ def step(gradient, state):
 
 @kernel
 def preconditioned(direction, state):
-    """See `Adam.preconditioned`."""
+    """That of an `Adam` in this state."""
     result, share = np.empty_like(direction), np.float32(1 - state.decayed[1])
     for i in range(len(direction)):
         result[i] = direction[i] / (math.sqrt(state.square[i] / share) + np.float32(EPSILON))

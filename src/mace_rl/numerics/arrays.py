@@ -49,20 +49,11 @@ def quantile(values: np.ndarray, share: float) -> float:
 
 
 @kernel
-def in_order(repeats: int, count: int) -> np.ndarray:
-    """0 … N - 1 in each of K rows, int64 [K, N]."""
-    order = np.empty((repeats, count), np.int64)
-    for k in range(repeats):
-        for n in range(count):
-            order[k, n] = n
-    return order
-
-
-@kernel
 def shuffled(draws: np.ndarray) -> np.ndarray:
-    """K permutations by Fisher and Yates from uniform draws, [K, N]."""
-    order = in_order(*draws.shape)
+    """K permutations by Fisher and Yates from uniform draws, [K, N]; int64."""
+    order = np.empty(draws.shape, np.int64)
     for k in range(len(draws)):
+        order[k] = np.arange(draws.shape[1])
         for n in range(draws.shape[1] - 1, 0, -1):
             other = min(int(draws[k, n] * (n + 1)), n)
             order[k, n], order[k, other] = order[k, other], order[k, n]

@@ -25,16 +25,7 @@ def fma(context: Any, a: Any, b: Any, c: Any) -> Any:
     """a · b + c rounded once, of three float32 or three float64."""
     if not a == b == c or a not in (types.float32, types.float64):
         return None
-    name = "fma.f32" if a is types.float32 else "fma.f64"
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = arguments[0].type
-        function = builder.module.declare_intrinsic(
-            f"llvm.{name}", (), ir.FunctionType(kind, [kind] * 3)
-        )
-        return builder.call(function, arguments)
-
-    return a(a, b, c), codegen
+    return a(a, b, c), lambda context, builder, signature, given: builder.fma(*given)
 
 
 def unary(result: Any, kind: Any, code: Callable[[Any, Any], Any]) -> Any:

@@ -74,19 +74,13 @@ class CompiledMLP:
 
         trace: what `forward` returned; grad_outputs: the loss's gradient at the outputs, [N, out].
         """
-        return self._gradients(trace, grad_outputs)[0]
+        return kernels.network_gradient(*trace.saved, self.parameters, grad_outputs, self.sizes)[0]
 
     def gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same, and the gradient with respect to the inputs, [N, in]."""
-        gradient, first = self._gradients(trace, grad_outputs)
-        return gradient, kernels.input_gradient(first, self.parameters, self.sizes)
-
-    def _gradients(self, trace: Trace, grad_outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # With respect to the parameters, and at the first layer.
-        inputs, activations = trace.saved
-        return kernels.network_gradient(
-            inputs, activations, self.parameters, grad_outputs, self.sizes
-        )
+        same = self.parameters, grad_outputs, self.sizes
+        gradient, at_first_layer = kernels.network_gradient(*trace.saved, *same)
+        return gradient, kernels.input_gradient(at_first_layer, self.parameters, self.sizes)
 
     def move_to(self, memory: np.ndarray) -> None:
         """See `Network`; raises `ValueError` for what compiled code would read as other numbers."""

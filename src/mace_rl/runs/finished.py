@@ -117,14 +117,14 @@ class FinishedRun:
         import pandas as pd
 
         path = self.folder / files.DIAGNOSTICS
-        content = io.BytesIO(self.content(path.name)) if path.exists() else None
+        if not path.exists():
+            return None
+        content = io.BytesIO(self.content(path.name))
         try:
-            table = pd.read_csv(content, dtype=float) if content else None
-            if table is not None:
-                if not (table["episode"].between(1, 2**53) & (table["episode"] % 1 == 0)).all():
-                    raise ValueError("no training writes such episodes")
-                table = table.astype({"episode": int})
-            return table
+            table = pd.read_csv(content, dtype=float)
+            if not (table["episode"].between(1, 2**53) & (table["episode"] % 1 == 0)).all():
+                raise ValueError("no training writes such episodes")
+            return table.astype({"episode": int})
         except (KeyError, ValueError):
             raise RecordError(f"{path}: {NEVER_WRITTEN}") from None
 

@@ -1,7 +1,8 @@
 """What stands around the method: where an error was, and numbers of parts that may be anybody's."""
 
 import logging
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -19,66 +20,37 @@ from mace_rl.numerics.normaliser import RunningNormaliser
 logger = logging.getLogger(__name__)
 
 
-class Located:
+@contextmanager
+def located(config: RunConfig, place: str) -> Iterator[None]:
     """A context in which an error says in which run it was, and at which `place` of it."""
-
-    def __init__(self, config: RunConfig, place: str) -> None:
-        self.config, self.place = config, place
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if not isinstance(error, Exception | SystemExit | GeneratorExit):
-            return
-        run = f"{self.config.environment} {self.config.variant} seed {self.config.seed}"
-        if isinstance(error, Refusal):
-            raise type(error)(f"{run}, {self.place}: {error}") from error.__cause__
-        if not isinstance(error, Exception):
-            raise Refusal(f"{run}, {self.place}: code raised {error!r}") from error
-        error.add_note(f"in {run}, {self.place}")
+    run = f"{config.environment} {config.variant} seed {config.seed}"
+    try:
+        yield
+    except Refusal as error:
+        raise type(error)(f"{run}, {place}: {error}") from error.__cause__
+    except (SystemExit, GeneratorExit) as error:
+        raise Refusal(f"{run}, {place}: code raised {error!r}") from error
+    except Exception as error:
+        error.add_note(f"in {run}, {place}")
+        raise
 
 
-class Checked:
-    """A proxy of `part`; subclasses check what it returns."""
-
-    def __init__(self, part: Any) -> None:
-        object.__setattr__(self, "part", part)
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "part":  # of a copy that is being made
-            raise AttributeError(name)
-        return getattr(self.part, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self.part, name, value)
+def checked_beta(controller: BetaController) -> float:
+    """What it sets for the next episode, in [0, 10]; `NonFiniteError` if it is not."""
+    beta = float(numbers("β", controller.next_beta(), ()))
+    require_within("β", beta, largest=LARGEST_BETA)
+    return beta
 
 
-class CheckedBeta(Checked):
-    """A `BetaController` whose β is a float in [0, 10]; `NonFiniteError` if it is not."""
-
-    part: BetaController
-
-    def next_beta(self) -> float:
-        beta = float(numbers("β", self.part.next_beta(), ()))
-        require_within("β", beta, largest=LARGEST_BETA)
-        return beta
-
-
-class CheckedBonus(Checked):
-    """An `IntrinsicReward` of finite numbers from 0 on; `NonFiniteError` if they are not."""
-
-    part: IntrinsicReward
-
-    def bonus(self, episode: Episode) -> Bonus:
-        bonus = self.part.bonus(episode)
-        if not isinstance(bonus, Bonus):
-            wanted = f"but should be a {Bonus.__module__}.Bonus"
-            raise ConfigError(f"{type(self.part).__name__}.bonus is {short_repr(bonus)}, {wanted}")
-        reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
-        largest = min(self.part.largest, TOO_LARGE)
-        require_within("the curiosity bonus", reward, 1e-6, largest)
-        return bonus._replace(reward=np.maximum(reward, 0.0))
+def checked_bonus(intrinsic: IntrinsicReward, episode: Episode) -> Bonus:
+    """That of an episode, from 0 on and not above `largest`; `NonFiniteError` if it is not."""
+    bonus = intrinsic.bonus(episode)
+    if not isinstance(bonus, Bonus):
+        wanted = f"but should be a {Bonus.__module__}.Bonus"
+        raise ConfigError(f"{type(intrinsic).__name__}.bonus is {short_repr(bonus)}, {wanted}")
+    reward = numbers("the curiosity bonus", bonus.reward, (len(episode),))
+    require_within("the curiosity bonus", reward, 1e-6, min(intrinsic.largest, TOO_LARGE))
+    return bonus._replace(reward=np.maximum(reward, 0.0))
 
 
 def require_learned(update: Update, learner: Learner) -> None:

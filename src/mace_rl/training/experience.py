@@ -26,11 +26,6 @@ class Experience:
     extrinsic: Evaluation
     intrinsic: Evaluation  # zeros in plain PPO, `without_bonus`
 
-    @property
-    def evaluations(self) -> dict[str, Evaluation]:
-        """Of both rewards."""
-        return {"extrinsic": self.extrinsic, "intrinsic": self.intrinsic}
-
     def with_normalised_returns(self) -> "Experience":
         """With centred returns, over the deviation of the total reward's, R_E + β R_I."""
         returns = self.extrinsic.returns + self.beta * self.intrinsic.returns
@@ -99,11 +94,11 @@ class Rollout(list[Experience]):
 
     def advantages_of(self, kind: str) -> np.ndarray:
         """Of the "extrinsic" or "intrinsic" reward, before scaling, float64 [N]."""
-        return self.joined(lambda item: item.evaluations[kind].advantages)
+        return self.joined(lambda item: getattr(item, kind).advantages)
 
     def returns(self, kind: str) -> np.ndarray:
         """The λ-returns of the "extrinsic" or "intrinsic" reward, float64 [N]."""
-        return self.joined(lambda item: item.evaluations[kind].returns)
+        return self.joined(lambda item: getattr(item, kind).returns)
 
 
 @kernel

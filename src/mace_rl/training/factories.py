@@ -39,30 +39,20 @@ from mace_rl.environments.environment import Environment
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.network import CompiledMLP, Network, mlp
 from mace_rl.numerics.normaliser import RunningNormaliser
-from mace_rl.training.checks import CheckedBeta, CheckedBonus
 
 
 def beta_controller(
     config: RunConfig, environment: Environment, streams: Streams
-) -> CheckedBeta | None:
+) -> BetaController | None:
     """What sets β in this variant; None for plain PPO."""
-    if isinstance(config.beta, NoBonus):
-        return None
-    return CheckedBeta(unchecked_controller(config, environment, streams))
-
-
-def unchecked_controller(
-    config: RunConfig, environment: Environment, streams: Streams
-) -> BetaController:
-    """The same as it is."""
     match config.beta:
+        case NoBonus():
+            return None
         case MetaBeta() as beta:
             assert config.meta is not None  # `RunConfig` checked that
             return meta_adaptation(beta, config.meta, environment, config.engine, streams)
         case ConstantBeta() | ExponentialBeta() | CustomBeta() as rule:
             return beta_rule(rule, streams["beta"], config.episodes)
-        case NoBonus():
-            raise ValueError("without a bonus there is no β")
 
 
 def meta_adaptation(
@@ -113,7 +103,7 @@ def beta_rule(
 
 def intrinsic_reward(
     config: RunConfig, environment: Environment, streams: Streams
-) -> CheckedBonus | None:
+) -> IntrinsicReward | None:
     """The bonus that β weighs: curiosity, or a user's own; None in plain PPO."""
     match config.bonus:
         case None:
@@ -121,11 +111,10 @@ def intrinsic_reward(
         case CuriosityBonus():
             assert config.novelty is not None
             space, size = environment.given_space, environment.observation_size
-            return CheckedBonus(Curiosity(config.memory, config.novelty, space, size, streams))
+            return Curiosity(config.memory, config.novelty, space, size, streams)
         case CustomBonus(estimator=estimator, arguments=arguments):
             key, stream = "bonus.estimator", streams["bonus"]
-            made = make(estimator, key, IntrinsicReward, False, environment, stream, **arguments)
-            return CheckedBonus(made)
+            return make(estimator, key, IntrinsicReward, False, environment, stream, **arguments)
 
 
 def environment(config: AgentConfig, streams: Streams) -> Environment:

@@ -13,7 +13,7 @@ import numpy as np
 from mace_rl.base.state import saved
 from mace_rl.environments.environment import Environment
 from mace_rl.environments.episode import Episode
-from mace_rl.environments.remembered import remembered, restore
+from mace_rl.environments.remembered import layers, remembered, restore
 from mace_rl.training.rollout import roll_out
 
 EPISODES, STEPS = 10, 1000  # after either of which a block of episodes is full
@@ -79,12 +79,9 @@ def seeded(seed: np.random.SeedSequence) -> Iterator[None]:
 
 def is_forgetful(environment: Environment) -> bool:
     """Whether the generator is known to be all that its next episode depends on."""
-    env: Any = environment.env
-    while env is not env.unwrapped:
-        if type(env).__module__ != PLAIN_WRAPPERS:
-            return False
-        env = env.env
-    return type(env).__module__.startswith(FORGETFUL)
+    env = environment.env
+    plain = all(type(layer).__module__ == PLAIN_WRAPPERS for layer in layers(env))
+    return plain and type(env.unwrapped).__module__.startswith(FORGETFUL)
 
 
 class LastEpisodes:

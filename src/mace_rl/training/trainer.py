@@ -31,7 +31,9 @@ from mace_rl.environments.episode import Episode
 from mace_rl.numerics.arrays import mean, root_mean_square, total
 from mace_rl.training import resuming
 from mace_rl.training.checks import (
-    Located,
+    checked_beta,
+    checked_bonus,
+    located,
     require_learned,
     warn_of_observations,
     warn_of_rewards,
@@ -71,7 +73,7 @@ class Trainer:
         while len(self.records) < self.config.episodes:
             start = len(self.records)
             rollout = self.collect()
-            with Located(self.config, f"the update after episode {len(self.records)}"):
+            with located(self.config, f"the update after episode {len(self.records)}"):
                 credit = self.meta_update(rollout)
                 update = self.ppo_update(rollout)
                 count = len(self.diagnostics) + 1, len(self.records), self.records[-1].env_steps
@@ -82,7 +84,7 @@ class Trainer:
         """Play episodes with the current policy until a rollout is full."""
         policy, rollout, steps = self.ppo.acting_policy(), Rollout(), 0
         while steps < self.config.ppo.rollout_steps and len(self.records) < self.config.episodes:
-            with Located(self.config, f"episode {len(self.records) + 1}"):
+            with located(self.config, f"episode {len(self.records) + 1}"):
                 episode = self.play_episode(policy)
                 item = self.advantages(episode)
                 own_units = self.config.ppo.normalise_returns
@@ -108,7 +110,7 @@ class Trainer:
         warn_of_rewards(self.config, unit, self.ppo.unit("extrinsic"), len(self.records) + 1)
         beta, bonus, intrinsic = 0.0, None, without_bonus(len(episode))
         if self.curiosity is not None and self.controller is not None:
-            beta, bonus = self.controller.next_beta(), self.curiosity.bonus(episode)
+            beta, bonus = checked_beta(self.controller), checked_bonus(self.curiosity, episode)
             intrinsic = self.ppo.advantages("intrinsic", observations, bonus.reward, ends)
             returns = discounted_returns(episode.rewards, self.config.ppo.discount)
             self.curiosity.remember(episode, returns)

@@ -17,13 +17,14 @@ from mace_rl.base.rng import Streams
 from mace_rl.base.state import Stateful, saved
 from mace_rl.beta.controller import BetaController
 from mace_rl.bonus.curiosity import Curiosity
-from mace_rl.config.beta import LARGEST_BETA, CustomBeta, MetaBeta
+from mace_rl.config.beta import CustomBeta, MetaBeta
 from mace_rl.config.section import ConfigError, short_repr
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.finite import require_within
 from mace_rl.numerics.matmul import dot
+from mace_rl.training.checks import checked_beta
 from mace_rl.training.factories import beta_rule, meta_adaptation
 
 USUAL_STEPS = 20  # whose R_curiosity is usual
@@ -151,8 +152,7 @@ class CuriosityTracker(Stateful):
             self.end(environment, terminated=False)
         if afresh:
             self.usual = copy.copy(self.usual_of_ended)
-        first, beta = np.array(self.spaces.encode(observation, 0)), self.controller.next_beta()
-        require_within("β", beta, largest=LARGEST_BETA)
+        first, beta = np.array(self.spaces.encode(observation, 0)), checked_beta(self.controller)
         asked = self.controller.asked
         self.recordings[environment] = Recording(beta, self.unit, asked, [first])
 

@@ -34,6 +34,7 @@ from gymnasium.vector.utils import iterate
 from mace_rl.config.section import ConfigError, check
 from mace_rl.config.wrappers import CuriosityConfig
 from mace_rl.environments.environment import stepped
+from mace_rl.environments.remembered import layers
 from mace_rl.environments.spaces import Spaces
 from mace_rl.runs.checkpoint import require_plain
 from mace_rl.wrapping.curiosity_tracker import PARTS, CuriosityTracker
@@ -63,7 +64,7 @@ class CuriosityMixin(RecordConstructorArgs):
         super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]  # Gymnasium's
         config = check(CuriosityConfig, settings, type(self).__name__)
         count, spaces = 1, (env.observation_space, env.action_space)
-        if autoresets(env):
+        if any(isinstance(layer, gymnasium.wrappers.Autoreset) for layer in layers(env)):
             raise ConfigError("Autoreset belongs outside: Autoreset(CuriosityReward(env))")
         if isinstance(env, VectorEnv):
             count, spaces = env.num_envs, (env.single_observation_space, env.single_action_space)
@@ -213,15 +214,6 @@ def given(arguments: dict[str, Any]) -> dict[str, Any]:
         for name, value in found.items()
         if value is not None or name not in ("memory", "novelty", "meta")
     }
-
-
-def autoresets(env: Any) -> bool:
-    """Whether `gymnasium.wrappers.Autoreset` is among an environment's wrappers."""
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.Autoreset):
-            return True
-        env = env.env
-    return False
 
 
 def name_of(env: Any) -> str:

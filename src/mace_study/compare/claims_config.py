@@ -189,11 +189,9 @@ def parse_claims(path: str | Path, learned: str = LEARNED) -> ClaimsConfig:
 
     The file calls that `LEARNED`. Another variant takes its place in every claim and in Table 1.
     """
-    claims = check(ClaimsConfig, read_yaml(Path(path)), str(path))
-    if learned == LEARNED:
-        return claims
-    changed = claims.model_dump(include={"families", "table1"})
-    return check(ClaimsConfig, claims.model_dump() | _with_learned(changed, learned), str(path))
+    given = read_yaml(Path(path))
+    renamed = {key: _with_learned(given[key], learned) for key in {"families", "table1"} & {*given}}
+    return check(ClaimsConfig, {**given, **renamed}, str(path))
 
 
 def _with_learned(part: Any, learned: str) -> Any:

@@ -37,7 +37,6 @@ class MetricsConfig(Section):
     threshold: float = Field(gt=0, lt=1)  # of the final return, for sample efficiency
     moving_average: PositiveInt  # W, episodes
     convergence_slope: float = Field(ge=0, lt=1)  # of the steepest so far: diminishing returns
-    convergence_band: float = Field(gt=0, lt=1)  # of the learning range, around the final return
     confidence: float = Field(gt=0, lt=1)  # of every interval
     bootstrap_repetitions: int = Field(ge=100, le=10**6)
     bootstrap_seed: NonNegativeInt

@@ -148,29 +148,6 @@ def convergence_steps(curve: LearningCurve) -> Attained:
     return curve.first(learned & minimal & curve.learned, 2 * window)
 
 
-def convergence_steps_steepest(curve: LearningCurve) -> Attained:
-    """The first episode after the steepest rise at which the slope is no longer positive.
-
-    The steepest rise can be the recovery from a late collapse. Censored: never, or not `learned`.
-    """
-    window, slopes = curve.settings.moving_average, curve.slopes
-    if not (slopes > 0).any():
-        return Attained(len(curve.returns), True)
-    steepest = int(np.argmax(slopes))  # the first of equals
-    return curve.first((slopes[steepest:] <= 0) & curve.learned, 2 * window + steepest)
-
-
-def convergence_steps_flattest(curve: LearningCurve) -> Attained:
-    """The first episode at which the absolute slope is smallest in all of training.
-
-    The most literal reading: it finds the flat start of a run that has yet to learn, or chance on
-    the final plateau. Censored: E < 2 windows, or not `learned`.
-    """
-    magnitude = np.abs(curve.slopes)
-    flattest = magnitude == magnitude.min(initial=np.inf)
-    return curve.first(flattest & curve.learned, 2 * curve.settings.moving_average)
-
-
 def convergence_steps_public_code(curve: LearningCurve) -> Attained:
     """The rule of the authors' public code, whatever the window configured here.
 
@@ -209,17 +186,6 @@ def sample_efficiency_range(curve: LearningCurve) -> Attained:
     return curve.first(reached & curve.learned, curve.settings.moving_average)
 
 
-def convergence_steps_range(curve: LearningCurve) -> Attained:
-    """The first episode from which on the moving average stays within band · (final - random).
-
-    Censored: the average ends farther from the final return, or not `learned`.
-    """
-    settings, gain = curve.settings, curve.final - curve.random_mean
-    near = np.abs(curve.average - curve.final) <= settings.convergence_band * gain
-    settled = np.logical_and.accumulate(near[::-1])[::-1]
-    return curve.first(settled & curve.learned, settings.moving_average)
-
-
 def early_return(curve: LearningCurve) -> float:
     """Mean return of the first episodes, as many as `last_part` has: how steep the curve begins."""
     count = len(last_part(curve.returns, curve.settings.final_fraction))
@@ -253,9 +219,6 @@ METRICS = (  # the area is under the learning curve, per episode
     Metric("solved", "Solved at the end", "share", solved, "solved_return"),
     _episodes(sample_efficiency_common, "Sample efficiency (common bar)", 1, "reference_return"),
     _episodes(sample_efficiency_range, "Sample efficiency (range)", 1),
-    _episodes(convergence_steps_range, "Convergence (range)", 1),
-    _episodes(convergence_steps_steepest, "Convergence (steepest)", 2),
-    _episodes(convergence_steps_flattest, "Convergence (flattest)", 2),
     replace(
         _episodes(convergence_steps_public_code, "Convergence (public code)", 0),
         earliest=_public_code_first,

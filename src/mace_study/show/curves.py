@@ -131,12 +131,6 @@ def mean_curves(
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
 
 
-def read_curves(path: Path) -> pd.DataFrame:
-    """What `seed_curves` or `mean_curves` was written as, to the bit (pandas 3.1.0 and later)."""
-    names = {"env": str, "variant": str}
-    return pd.read_csv(path, dtype=names, keep_default_na=False, na_values=[""])
-
-
 def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
     """`limits`, the upper one raised to the largest of `values`: β may be above 1."""
     return limits[0], max(limits[1], values.max())

@@ -270,11 +270,6 @@ def _placed(
     return said, table.assign(place=pd.concat(placed)), blocks
 
 
-def readings(source: Source) -> pd.DataFrame:
-    """readings.csv, which `compare.readings` makes."""
-    return source.data["readings"]
-
-
 def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
     """Every reading as a line of dots with intervals; the paper's are hollow."""
     environments, lines = list(table["env"].unique()), in_order(table)
@@ -323,5 +318,5 @@ PICTURES = {
     "constants": Picture(constants, draw_constants),
     "solved": Picture(solved, draw_solved),
     "forest": Picture(forest, draw_forest),
-    "readings": Picture(readings, draw_readings),
+    "readings": Picture(lambda source: source.data["readings"], draw_readings),
 }

@@ -1,22 +1,22 @@
 """The sections of a study, each a title, a note and a table: what its pages are made of."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
-from mace_rl.base.tables import read_table
+from mace_rl.base.tables import read_made, read_table
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
 from mace_study.compare.comparisons import ALL
-from mace_study.compare.ledger import Answer, read_ledger
+from mace_study.compare.ledger import Answer
 from mace_study.compare.summary import from_to
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.betas import CORRELATIONS, LABELS, betas_columns
 from mace_study.measure.metrics_csv import read_metrics
 from mace_study.show import tables
 
-TEXTS = ("env", "variant", "baseline", "metric", "kind", "reading", "source", "test")  # columns
 RETURNS = {"area_under_curve": "Mean return of training", "final_return": "Final return"}
 PARTS = (
     "Differences count in the claim's favour, with their intervals. *p*: of no difference,"
@@ -37,18 +37,19 @@ class Section(NamedTuple):
 
 
 def read_data(
-    found: Mapping[str, Any], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
-) -> tuple[dict[str, pd.DataFrame], list[Answer]]:
-    """The data of these runs, and the ledger, empty without one, from files by their names."""
-    # Names are as they were given, NA and 0.1 too; an empty cell is NaN.
-    how: Any = {"dtype": dict.fromkeys(TEXTS, str), "keep_default_na": False, "na_values": [""]}
-    files = {name: path for name, path in found.items() if str(path).endswith(".csv")}
-    data = {name: pd.read_csv(path, **how) for name, path in files.items()}
-    if "metrics" in found:
-        data["metrics"] = read_metrics(found["metrics"], runs, settings)
-    if "betas" in found:
-        data["betas"] = read_table(found["betas"], betas_columns(settings))
-    return data, read_ledger(found["ledger"]) if "ledger" in found else []
+    folder: Path, names: Iterable[str], runs: Sequence[Sequence[str | int]], settings: MetricsConfig
+) -> dict[str, pd.DataFrame]:
+    """The data with these names in a study's folder; that of metrics.csv is to be of `runs`."""
+    data = {}
+    for name in names:
+        path = folder / f"{name}.csv"
+        if name == "metrics":
+            data[name] = read_metrics(path, runs, settings)
+        elif name == "betas":
+            data[name] = read_table(path, betas_columns(settings))
+        else:
+            data[name] = read_made(path)
+    return data
 
 
 def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
@@ -130,7 +131,7 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
         )
         own = table[(table["metric"] == metric) & (table["env"] != ALL)]
         frame = tables.comparisons(own, means, settings)
-        yield Section(f"{title}: differences", note, frame.drop(columns=["metric", "P"]))
+        yield Section(f"{title}: differences", note, frame)
 
 
 def _others(

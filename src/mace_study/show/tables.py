@@ -9,7 +9,7 @@ import pandas as pd
 
 from mace_rl.config.agent import CompiledNetwork, PPOConfig, TorchModule
 from mace_study.compare.claims_config import Table1Config, Table2Config
-from mace_study.compare.ledger import Answer, Finding
+from mace_study.compare.ledger import Answer
 from mace_study.compare.readings import in_order, ranked, title
 from mace_study.compare.statistics import interval
 from mace_study.compare.summary import digits_by_metric
@@ -130,17 +130,14 @@ def solved(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """comparisons.csv, with as many digits as `means`, a `summary`, is shown with."""
-    digits, labels = digits_by_metric(means, settings), metric_labels(settings)
-    rows = []
+    """comparisons.csv in single environments, with as many digits as `means`, a `summary`, has."""
+    digits, rows = digits_by_metric(means, settings), []
     for _, row in table.iterrows():
-        # All environments together have no digits, and no values that would need them.
-        shown = digits.get((row["env"], row["metric"]), 0)
-        own = [row["env"], labels[row["metric"]], f"{row['variant']} over {row['baseline']}"]
-        own += [_number(row["seeds"]), _estimate(row, "difference", shown, ends="")]
-        own += [_number(row["p_value"], 4), _number(row["p_holm"], 4)]
-        rows.append([*own, _estimate(row, "probability", 2)])
-    heads = ["environment", "metric", "", "n", "difference", "p", "p (Holm)", "P"]
+        shown = digits[row["env"], row["metric"]]
+        own = [row["env"], f"{row['variant']} over {row['baseline']}", number(row["seeds"])]
+        own += [_estimate(row, "difference", shown, ends="")]
+        rows.append([*own, number(row["p_value"], 4), number(row["p_holm"], 4)])
+    heads = ["environment", "", "n", "difference", "p", "p (Holm)"]
     return pd.DataFrame(rows, columns=heads)
 
 
@@ -155,7 +152,7 @@ def aggregate(table: pd.DataFrame) -> pd.DataFrame:
     """aggregate.csv."""
     rows = []
     for _, row in table.iterrows():
-        own = [row["variant"], row["metric"].replace("_", " "), _number(row["runs"])]
+        own = [row["variant"], row["metric"].replace("_", " "), number(row["runs"])]
         rows.append([*own, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
     return pd.DataFrame(rows, columns=["", "score of", "runs", "mean", "interquartile mean"])
 
@@ -185,7 +182,7 @@ def betas(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
         if runs.nunique()[["beta_end", "beta_lowest", "beta_highest"]].max() == 1:
             continue
-        rows.append({"environment": str(environment), "": str(variant), "n": _number(len(runs))})
+        rows.append({"environment": str(environment), "": str(variant), "n": number(len(runs))})
         for name in runs.columns.intersection(list(LABELS), sort=False):
             found = runs[name].to_numpy()
             if name in CORRELATIONS:
@@ -208,58 +205,45 @@ def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
     return frame if any(answer.paper for answer in answers) else frame.iloc[:, :-1]
 
 
-def parts(answers: Sequence[Answer], how: str, names: Mapping[str, str]) -> pd.DataFrame:
-    """Every part of the claims, measured in one of the ways, with these `names`, if any."""
-    rows = []
+def parts(answers: Sequence[Answer], how: str) -> pd.DataFrame:
+    """Every part of the claims, measured in one of the ways."""
+    rows: list[dict[str, str | Cell]] = []
     for answer, part in ((one, part) for one in answers for part in one.ways[how].parts):
         # Of a return as many as the margin needs, which depends on the environment's scale.
         of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
         digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
-        pair = (names.get(name, name) for name in (part.variant, part.baseline or "0"))
-        environment = "all" if len(part.environments) > 1 else part.environments[0]
-        sizes = part.in_paper, part.worth_mentioning, part.detectable
-        row: list[str | Cell] = [answer.claim, environment, names.get(part.metric, part.metric)]
-        row += [" over ".join(pair), _number(part.seeds)]
-        row += [_estimate(vars(part), "difference", digits, ends="")]
-        row += [_number(p, 3) for p in (part.p_holm, part.p_equivalent_holm)]
-        row += [_estimate(vars(part), "probability", 2), *(_number(one, digits) for one in sizes)]
-        row += _by_size(part, digits)
-        rows.append(row)
-    heads = ["", "environment", "metric", "over", "n", "difference", "p", "p within", "P", "paper"]
-    heads += ["margin", "detectable", "room", "one seed", "replication", "size"]
-    return pd.DataFrame(rows, columns=[*heads, ""])
+        row: dict[str, str | Cell] = {"": answer.claim}
+        row["environment"] = "all" if len(part.environments) > 1 else part.environments[0]
+        row |= {"metric": part.metric, "over": f"{part.variant} over {part.baseline or 0}"}
+        row["n"] = number(part.seeds)
+        row["difference"] = _estimate(vars(part), "difference", digits, ends="")
+        row |= {"p": number(part.p_holm, 3), "room": number(part.room, max(1, digits))}
+        row["margin"] = number(part.worth_mentioning, digits)
+        row["detectable"] = number(part.detectable, digits)
+        rows.append(row | {"size": part.size, "outcome": part.outcome.replace("_", " ")})
+    return pd.DataFrame(rows)
 
 
 def parts_in_short(answers: Sequence[Answer], how: str) -> pd.DataFrame:
-    """What each part came out as, and what decided it; `parts` has the rest."""
-    frame = parts(answers, how, {})
-    frame = frame.set_axis(["", *frame.columns[1:-1], "outcome"], axis=1)
+    """What each part came out as, and what decided it; claims.json has the rest."""
+    frame = parts(answers, how)
     sized = frame["outcome"].isin(["shown", "reversed"]) & (frame["size"] != "open")
     frame["outcome"] = frame["outcome"].where(~sized, frame["outcome"] + ", " + frame["size"])
     return frame[["", "outcome", "environment", "metric", "over", "difference", "p"]]
 
 
-def _by_size(part: Finding, digits: int) -> list[str | Cell]:
-    """Room, replication, size and outcome of a part."""
-    ends = (number(end, digits) for end in (part.predicted_low, part.predicted_high))
-    chance = "–" if math.isnan(part.predicted_low) else " to ".join(ends)
-    outcome = part.outcome.replace("_", " ")
-    return [_number(part.room, max(1, digits)), chance, part.replication, part.size, outcome]
-
-
 def side_by_side(studies: Mapping[str, Sequence[Answer]], how: str) -> pd.DataFrame:
     """`parts` of several studies in short, each study in a column."""
-    part, columns = ["", "environment", "metric", "over"], []
+    columns = []
     for answers in studies.values():
-        frame = parts(answers, how, {})
-        frame = frame.set_axis([*part, *frame.columns[4:-1], "outcome"], axis=1).set_index(part)
+        frame = parts(answers, how).set_index(["", "environment", "metric", "over"])
         columns.append(pd.Series([_in_short(row) for _, row in frame.iterrows()], frame.index))
     return pd.concat(columns, axis=1, keys=studies, sort=False).fillna("").reset_index()
 
 
 def _in_short(part: pd.Series) -> Cell:
     size = f", {part['size']}" if part["outcome"] in ("shown", "reversed") else ""
-    numbers = (f"{name} {part[name].values[0].text}" for name in ("n", *SIZES))
+    numbers = (f"{name} {part[name]}" for name in ("n", *SIZES))
     return part["difference"]._replace(note=f"{', '.join(numbers)}: {part['outcome']}{size}")
 
 
@@ -300,10 +284,6 @@ def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell
     """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
     prefix = f"{name}_" if ends is None else ends
     return Cell([estimate((row[name], row[f"{prefix}low"], row[f"{prefix}high"]), digits)])
-
-
-def _number(value: float | None, digits: int = 0) -> Cell:
-    return Cell([Value(number(value, digits))])
 
 
 def _setting(ppo: Mapping[str, PPOConfig], name: str) -> str | Cell:
