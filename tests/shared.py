@@ -3,7 +3,10 @@
 import copy
 import itertools
 import json
+import os
 import re
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -60,6 +63,16 @@ def learned(kind: str = "evidence", **settings: Any) -> dict[str, Any]:
     own = EVIDENCE if kind == "evidence" else {"horizon": 10, "max_credit": 3.0}
     return {"kind": "meta", "initial": 0.4, "objective": {"kind": kind, **own, **settings}}
 
+
+# A program that trains a run, given as JSON, into a folder.
+TRAIN = """
+import sys
+from pathlib import Path
+from mace_rl.config.run import RunConfig
+from mace_rl.runs.run import run
+
+run(RunConfig.model_validate_json(sys.argv[1]), Path(sys.argv[2]), keep_checkpoint=True)
+"""
 
 # What is in the folder of a run, at its end and before.
 OUTCOME = ["agent.pt", "diagnostics.csv", "episodes.csv"]
@@ -233,29 +246,36 @@ def contents(results: Path) -> dict[str, bytes]:
     return found
 
 
-def call(monkeypatch, *words: str) -> tuple[int, str]:
-    """Exit code and message of `mace-rl words`."""
-    monkeypatch.setattr(sys, "argv", ["mace-rl", *words])
+def call(monkeypatch, *words: str, tool: ModuleType = cli) -> tuple[int, str]:
+    """Exit code and message of `mace-rl words`, or of another tool's."""
+    monkeypatch.setattr(sys, "argv", [tool.__name__, *words])
     try:
-        cli.main()
+        tool.main()
     except SystemExit as exit_:
         return (exit_.code, "") if isinstance(exit_.code, int) else (1, str(exit_.code))
     return 0, ""
 
 
-def refusal(monkeypatch, *words: str) -> str:
-    """The line with which `mace-rl words` fails."""
-    code, said = call(monkeypatch, *words)
-    assert code == 1 and "\n" not in said
+def refusal(monkeypatch, *words: str, tool: ModuleType = cli) -> str:
+    """The line with which it fails."""
+    code, said = call(monkeypatch, *words, tool=tool)
+    assert code == 1 and said and "\n" not in said
     return said
 
 
-def message(monkeypatch: pytest.MonkeyPatch, tool: ModuleType, *words: str) -> str:
-    monkeypatch.setattr("sys.argv", [tool.__name__, *words])
-    with pytest.raises(SystemExit) as ended:
-        tool.main()
-    assert isinstance(ended.value.code, str) and "\n" not in ended.value.code
-    return ended.value.code
+NO_LATEX = shutil.which("pdflatex") is None and "CI" not in os.environ
+
+
+def pdflatex(folder: Path, packages: Iterable[str], body: str) -> str:
+    """What the real one says of a page."""
+    head = "\n".join(["\\documentclass{article}", *packages])
+    page = f"{head}\n\\begin{{document}}\n{body}\\end{{document}}\n"
+    (folder / "page.tex").write_text(page, encoding="utf-8")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
+    run = subprocess.run(command, cwd=folder, capture_output=True, check=False)
+    said = run.stdout.decode(errors="replace")
+    assert run.returncode == 0, re.findall(r"(?m)^!.*\n(?:.*\n){3}", said)
+    return said
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from invented import episode_columns
-from shared import message
+from shared import refusal, refused
 
 from mace_rl.base import files
 from mace_rl.library import settings
@@ -19,14 +19,14 @@ from mace_rl.training.records import rounded, write_episodes
 from tools import kept_runs
 
 
-def make_run(folder: Path, number: int, episodes: int = 30, agent: bytes = b"agent") -> None:
+def make_run(folder: Path, number: int, episodes: int = 30, **others: np.ndarray) -> None:
     folder.mkdir(parents=True)
     columns = episode_columns(episodes, number)
     columns["beta"] = np.array([rounded(value) for value in columns["beta"]])
     if number % 2 == 0:  # the others have all digits of a double
         columns["extrinsic_return"] = -columns["length"].astype(float)
-    write_episodes(folder / files.EPISODES, columns)
-    (folder / files.AGENT).write_bytes(agent)
+    write_episodes(folder / files.EPISODES, columns | others)
+    (folder / files.AGENT).write_bytes(b"agent")
     digests = {name: file_digest(folder / name) for name in (files.EPISODES, files.AGENT)}
     config = {"environment": "A-v1", "variant": "ppo", "seed": number, "episodes": episodes}
     record = {"config": config, "versions": {}, "sources": "", "machine": {}, "outputs": digests}
@@ -67,17 +67,12 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
 
 def test_six_digits_of_any_size_are_exact(tmp_path: Path) -> None:
     draws, run = np.random.default_rng(0), tmp_path / "results/runs/A-v1/ppo/seed1"
-    make_run(run, 1, episodes=3000)
-    columns = episode_columns(3000)
-    columns["beta"] = np.array([rounded(10.0**power) for power in draws.uniform(-9, 0, 3000)])
-    write_episodes(run / files.EPISODES, columns)
-    record = json.loads((run / files.RECORD).read_text())
-    record["outputs"][files.EPISODES] = file_digest(run / files.EPISODES)
-    (run / files.RECORD).write_text(json.dumps(record))
+    returns = episode_columns(3000)["extrinsic_return"]
+    betas = np.array([rounded(10.0**power) for power in draws.uniform(-9, 0, 3000)])
+    make_run(run, 1, episodes=3000, extrinsic_return=returns, beta=betas)
     kept_runs.pack(tmp_path / "results", tmp_path / "kept")
     ((_, episodes),) = kept_runs.read(tmp_path / "kept/A-v1.parquet").values()
-    assert (episodes["beta"] == columns["beta"]).all()
-    assert (episodes["extrinsic_return"] == columns["extrinsic_return"]).all()
+    assert (episodes["beta"] == betas).all() and (episodes["extrinsic_return"] == returns).all()
 
 
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
@@ -118,7 +113,7 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
 def test_what_cannot_be_done_is_one_line(tmp_path, monkeypatch, words, said) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "unfinished/runs/A-v1/ppo/seed0").mkdir(parents=True)
-    assert message(monkeypatch, kept_runs, *words) == f"kept_runs: {said}"
+    assert refusal(monkeypatch, *words, tool=kept_runs) == f"kept_runs: {said}"
     assert not (tmp_path / "goal").exists()
 
 
@@ -170,6 +165,5 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, damage: str) -> N
         pd.DataFrame({"variant": ["ppo"]}).to_parquet(path)
     else:
         pd.read_parquet(path).assign(digest="0" * 64).to_parquet(path)
-    with pytest.raises(ValueError, match=re.escape(str(path))) as refused:
+    with refused(ValueError, re.escape(str(path))):
         kept_runs.read(path)
-    assert "\n" not in str(refused.value)

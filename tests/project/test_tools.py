@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
-from shared import ROOT, Bonanza, message
+from shared import ROOT, Bonanza, refusal
 from snakemake.exceptions import WorkflowError
 from snakemake.utils import validate
 
@@ -168,7 +168,7 @@ def test_what_has_no_random_return(monkeypatch, tmp_path, words, expected) -> No
     monkeypatch.chdir(tmp_path)
     maps = "environment_settings: {CartPole-v1: {environment_arguments: {map_name: 4x4}}}\n"
     (tmp_path / "maps.yaml").write_text(maps)
-    said = message(monkeypatch, random_return, "--", *words)
+    said = refusal(monkeypatch, "--", *words, tool=random_return)
     assert said.startswith(f"random_return: {expected}")
 
 

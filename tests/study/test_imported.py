@@ -5,11 +5,12 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from shared import ROOT, message
+from shared import ROOT, call, refusal
 
 from mace_rl.runs.finished import FinishedRun
 from mace_study import imported
@@ -25,11 +26,6 @@ families:
         statement: B ends above A
         parts: {by return: [{environments: [Walk-v0], metric: final_return, variant: b, over: [a]}]}
 """
-
-
-def brought(monkeypatch, *words) -> None:
-    monkeypatch.setattr("sys.argv", ["mace-import", *map(str, words)])
-    imported.main()
 
 
 def test_monitors_of_a_vector_environment_are_one_run_as_their_own_library_reads_them(tmp_path):
@@ -55,8 +51,8 @@ def test_what_export_writes_comes_back_with_beta(monkeypatch, tmp_path, trained)
 
     folder = trained(variant="mace_fixed", episodes=5)
     export.write(export.columns(folder), tmp_path / "runs.csv")
-    words = "--env", "CartPole-v1", "--variant", "back", "--out", tmp_path / "out"
-    brought(monkeypatch, tmp_path / "runs.csv", *words)
+    words = "--env", "CartPole-v1", "--variant", "back", "--out", str(tmp_path / "out")
+    assert call(monkeypatch, str(tmp_path / "runs.csv"), *words, tool=imported) == (0, "")
     back = FinishedRun(tmp_path / "out" / "runs" / "CartPole-v1" / "back" / "seed0").rows
     for row, own in zip(back, FinishedRun(folder).rows, strict=True):
         assert (row.extrinsic_return, row.env_steps) == (own.extrinsic_return, own.env_steps)
@@ -82,24 +78,29 @@ def test_a_mistaken_file_or_option_is_named_in_one_line(monkeypatch, tmp_path, k
     content, options, said = MISTAKES[kind]
     (tmp_path / "runs.csv").write_text(content)
     words = ["--env", "A-v0", "--variant", "a", "--out", str(tmp_path / "out"), *options.split()]
-    assert said in message(monkeypatch, imported, str(tmp_path / "runs.csv"), *words)
+    assert said in refusal(monkeypatch, str(tmp_path / "runs.csv"), *words, tool=imported)
     assert not (tmp_path / "out").exists()
 
 
 def test_only_runs_that_each_variant_has_are_in_the_study(monkeypatch, tmp_path, capsys, trained):
-    files = [tmp_path / f"{number}.csv" for number in range(3)]
+    files = [f"{tmp_path}/{number}.csv" for number in range(3)]
     for file in files:
-        file.write_text(GOOD)
+        Path(file).write_text(GOOD)
     out = tmp_path / "out"
-    brought(monkeypatch, *files, "--env", "A-v0", "--variant", "a", "--out", out)
-    brought(monkeypatch, *files[:2], "--env", "A-v0", "--variant", "b", "--out", out)
+
+    def brought(count: int, variant: str) -> None:
+        words = "--env", "A-v0", "--variant", variant, "--out", str(out)
+        assert call(monkeypatch, *files[:count], *words, tool=imported) == (0, "")
+
+    brought(3, "a")
+    brought(2, "b")
     assert "not in the study, since another variant lacks it: A-v0 a 2" in capsys.readouterr().out
-    brought(monkeypatch, *files[:1], "--env", "A-v0", "--variant", "a", "--out", out)  # again
+    brought(1, "a")  # again
     assert "not in the study, since another variant lacks it: A-v0 b 1" in capsys.readouterr().out
     place = out / "runs" / "CartPole-v1" / "ppo" / "seed0"
     shutil.copytree(trained(episodes=5), place)
     words = "--env", "CartPole-v1", "--variant", "ppo", "--out", str(out)
-    said = message(monkeypatch, imported, str(files[0]), *words)
+    said = refusal(monkeypatch, files[0], *words, tool=imported)
     assert f"{place} is a run that was trained here" in said
 
 
@@ -116,7 +117,8 @@ def test_the_workflow_judges_them_without_training(monkeypatch, tmp_path):
             (tmp_path / f"{name}{seed}.csv").write_text(text)
         own = [f"{name}{seed}.csv" for seed in range(10)]
         words = "--env", "Walk-v0", "--variant", name, "--return", "score", "--random-return", "0"
-        brought(monkeypatch, *own, *words, "--label", name.upper(), "--out", "walk")
+        words += "--label", name.upper(), "--out", "walk"
+        assert call(monkeypatch, *own, *words, tool=imported) == (0, "")
     (tmp_path / "claims.yaml").write_text(CLAIMS)
     (tmp_path / "own.yaml").write_text(
         "claims: claims.yaml\nmetrics: {reference_return: {Walk-v0: 3}}\n"

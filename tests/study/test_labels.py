@@ -1,12 +1,8 @@
 """Labels in LaTeX: whatever a configuration lets through, a real pdflatex sets."""
 
-import os
-import re
-import shutil
-import subprocess
-
 import pytest
 from pydantic import ValidationError
+from shared import NO_LATEX, pdflatex
 
 from mace_rl.config.section import ConfigError
 from mace_study.config.labels import escaped, packages, require_latex
@@ -24,7 +20,6 @@ def allowed(label: str) -> bool:
 
 # Each between letters: a space or '_' at an end would be refused for that.
 ALLOWED = [chr(code) for code in range(0x20, 0x3000) if allowed(f"a{chr(code)}b")]
-NO_LATEX = shutil.which("pdflatex") is None and "CI" not in os.environ
 
 
 def test_special_characters_are_escaped_once() -> None:
@@ -54,11 +49,4 @@ def test_pdflatex_sets_every_character_with_the_packages_that_are_named(tmp_path
     assert len(groups) == 5
     for needed, characters in groups.items():
         body = "".join(f"\\hbox{{{escaped(f'a{character}b')}}}\n" for character in characters)
-        head = "\\documentclass{article}\n" + "\n".join(needed)
-        page = f"{head}\n\\begin{{document}}\n{body}\\end{{document}}\n"
-        (tmp_path / "page.tex").write_text(page, encoding="utf-8")
-        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
-        run = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
-        said = run.stdout.decode(errors="replace")
-        assert run.returncode == 0, re.findall(r"(?m)^!.*\n(?:.*\n){3}", said)
-        assert "Missing character" not in said
+        assert "Missing character" not in pdflatex(tmp_path, needed, body)

@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from invented import CLAIMS, ENVIRONMENTS, PAPERS, QUICK, ROBUST, VARIANTS, table_for_claims
 from matplotlib.figure import Figure
-from shared import illegible, message
+from shared import illegible, refusal
 
 from mace_study.compare import single_seeds as d
 from mace_study.compare.ledger import Judgement, to_json
@@ -163,7 +163,5 @@ def test_worlds_are_brought_together(tmp_path, monkeypatch) -> None:
     assert draws.to_numpy().tolist() == [["tuned", 18, 4], ["published", 6, 1]] * 2  # by both rules
     whole = pd.read_csv(tmp_path / "published/metrics.csv")
     whole[:-1].to_csv(tmp_path / "published/metrics.csv", index=False)
-    said = message(monkeypatch, worlds, str(tmp_path))
+    said = refusal(monkeypatch, str(tmp_path), tool=worlds)
     assert "published/metrics.csv: the runs of Acrobot-v1 are not complete: " in said
-    said = message(monkeypatch, worlds, str(tmp_path / "tuned"))
-    assert said.startswith(f"worlds: {tmp_path / 'tuned'} has no tuned/metrics.csv")

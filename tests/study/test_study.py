@@ -16,7 +16,7 @@ from matplotlib.colors import to_hex
 from matplotlib.ft2font import FT2Font
 from shared import refused
 
-from mace_rl.config.reading import _read, read_options, read_yaml
+from mace_rl.config.reading import _read, merge, read_options, read_yaml
 from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_study.compare.claims_config import read_claims
@@ -27,17 +27,15 @@ RULES = CONFIG.parent / "workflow" / "rules"
 PLAIN = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
 
 
-def changed(over: dict[str, Any], base: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A copy of config.yaml's content with values replaced, or deleted where they are "DELETE"."""
-    result = copy.deepcopy(PLAIN if base is None else base)
-    for key, value in over.items():
-        if value == "DELETE":
-            del result[key]
-        elif isinstance(value, dict) and isinstance(result.get(key), dict):
-            result[key] = changed(value, result[key])
-        else:
-            result[key] = value
-    return result
+def changed(over: dict[str, Any]) -> dict[str, Any]:
+    """config.yaml's content with values replaced, or deleted where they are "DELETE"."""
+
+    def without(part: Any) -> Any:
+        if not isinstance(part, dict):
+            return copy.deepcopy(part)
+        return {key: without(value) for key, value in part.items() if value != "DELETE"}
+
+    return without(merge(PLAIN, over))
 
 
 # What is read over config.yaml  # what the message names: the key, the value, what would be right

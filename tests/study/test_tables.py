@@ -1,9 +1,6 @@
 """Every table from small frames: numbers against scipy, three renderings of the same cells."""
 
-import os
 import re
-import shutil
-import subprocess
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -27,6 +24,7 @@ from invented import (
     table_for_claims,
     table_for_tables,
 )
+from shared import NO_LATEX, pdflatex
 
 from mace_rl.config.agent import PPOConfig, TorchModule
 from mace_study.compare import summary
@@ -225,9 +223,6 @@ def test_a_cell_in_each_rendering() -> None:
     )
 
 
-NO_LATEX = shutil.which("pdflatex") is None and "CI" not in os.environ
-
-
 @pytest.mark.skipif(NO_LATEX, reason="needs pdflatex")
 def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> None:
     many = metrics([*ENVIRONMENTS, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)
@@ -244,15 +239,9 @@ def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> 
     ]
     body = "\n".join(fragments)
     assert body.isascii() and body.count(r"\label") == 3
-    (tmp_path / "page.tex").write_text(
-        "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n"
-        f"{body}\\end{{document}}\n"
-    )
-    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stdout
+    said = pdflatex(tmp_path, ["\\usepackage{booktabs}"], body)
     for trouble in ("Overfull \\hbox", "Float too large", "Missing character"):
-        assert trouble not in run.stdout
+        assert trouble not in said
 
 
 def test_names_are_read_as_they_were_written(tmp_path: Path) -> None:
