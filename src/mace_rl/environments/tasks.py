@@ -151,12 +151,7 @@ class BarrenRegion(gymnasium.Env):
     to 3 go north, east, south and west, or nowhere if there is a wall (#). In the room the
     observation has a screen with new random numbers every step; elsewhere these are 0.
 
-    - PPO should learn to leave the room, for its cost, and seldom reach the goal.
-    - Novelty alone can outweigh the cost, as the screen never repeats.
-    - With novelty × relevance the screen's numbers soon resemble remembered ones of no use, while
-      the corridor ahead resembles none. docs/study.md has what came out.
-
-    `screen=0` is the control: no numbers, so novelty alone should do well.
+    `screen=0` is the control: no numbers. docs/study.md has what came out.
 
     Observation: east and north of the map's middle, each from -1 to 1; then `screen` numbers in
     [-1, 1]; float32 [2 + screen].
