@@ -76,6 +76,11 @@ def make(folder: Path) -> list[str]:
     for name, picture in pictures.items():
         save_figure(picture, goal / f"{name}.png")
     origin = f"From {', '.join(f'[{world}](../{world})' for world in there)}, by {COMMAND}."
+    origin += "".join(
+        f" The learned β of {world} is `{WORLDS[world]}`."
+        for world in there
+        if WORLDS[world] != LEARNED
+    )
     sections = _sections(tables, look)
     if answers:
         note = f"Difference in the claim's favour, 95 % interval, and what the {RULE} says of it."

@@ -33,6 +33,7 @@ OUTCOMES = {
 }
 INK = "#262626"  # as seaborn draws axes
 LINE = 0.6  # the height of a line of words, where a part has 1
+FEW_ENVIRONMENTS = 4  # in a picture with a row for each
 SMALL_LETTERS = 141  # of the smallest words, as many as stand side by side in a picture
 
 
@@ -53,12 +54,13 @@ def every_seed(source: Source) -> pd.DataFrame:
 
 
 def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
-    """A dot per run, a dash at the mean of a variant; a row of panels per environment."""
+    """A dot per run, a dash at the mean of a variant; the panels of an environment abreast."""
     jitter = pd.Series(np.random.default_rng(0).uniform(-0.3, 0.3, len(table)), table.index)
     places = {name: place for place, name in enumerate(table["variant"].unique())}
     with style():
         groups = table.groupby(["env", "metric"], sort=False)
-        figure, panels = grid(groups.ngroups, table["metric"].nunique())
+        abreast = 2 if table["env"].nunique() > FEW_ENVIRONMENTS else 1  # lest it be a long strip
+        figure, panels = grid(groups.ngroups, abreast * table["metric"].nunique())
         for ((environment, metric), shown), axes in zip(groups, panels, strict=True):
             for variant, runs in shown.groupby("variant", sort=False):
                 name, place, values = str(variant), places[variant], runs["value"]
@@ -67,7 +69,8 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
                 dots.set(alpha=0.7, linewidth=0, label=look.labels[name])
                 axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colour)
             axes.set_xticks([])
-            axes.set_title(f"{environment}:\n{look.metrics[str(metric)].lower()}")
+            title = f"{environment}:\n{look.metrics[str(metric)].lower()}"
+            axes.set_title(title, fontsize="x-small" if abreast > 1 else None)
         legend(figure, "Dot: one seed. Line: their mean.")
     return figure
 
