@@ -272,9 +272,9 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
         frame = order.merge(wide).merge(same, "left", left_on="claim", right_index=True).fillna("")
         frame = frame.sort_values("claim", key=lambda names: names.str[1:].astype(int))
         note = (
-            f"†: the claim is about Hopper, too, where at most {DEFAULT} has runs; asked of the other"
-            f" environments, and not counted. *As the default*: readings with {DEFAULT}'s answer, of"
-            " all."
+            f"†: the claim is about Hopper, too, where at most {DEFAULT} has runs; asked of the"
+            f" other environments, and not counted. *As the default*: readings with {DEFAULT}'s"
+            " answer, of all."
         )
         found.append(Section(f"{world}: each claim, by reading", note, frame.map(str)))
     note = (
