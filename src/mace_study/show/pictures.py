@@ -59,8 +59,9 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
     places = {name: place for place, name in enumerate(table["variant"].unique())}
     with style():
         groups = table.groupby(["env", "metric"], sort=False)
-        abreast = 2 if table["env"].nunique() > FEW_ENVIRONMENTS else 1  # lest it be a long strip
-        figure, panels = grid(groups.ngroups, abreast * table["metric"].nunique())
+        many = table["env"].nunique() > FEW_ENVIRONMENTS  # two abreast, lest it be a long strip
+        small: dict[str, Any] = {"fontsize": "x-small"} if many else {}
+        figure, panels = grid(groups.ngroups, (1 + many) * table["metric"].nunique())
         for ((environment, metric), shown), axes in zip(groups, panels, strict=True):
             for variant, runs in shown.groupby("variant", sort=False):
                 name, place, values = str(variant), places[variant], runs["value"]
@@ -70,7 +71,7 @@ def draw_every_seed(table: pd.DataFrame, look: PlotStyle) -> Figure:
                 axes.hlines(values.mean(), place - 0.4, place + 0.4, color=colour)
             axes.set_xticks([])
             title = f"{environment}:\n{look.metrics[str(metric)].lower()}"
-            axes.set_title(title, fontsize="x-small" if abreast > 1 else None)
+            axes.set_title(title, **small)
         legend(figure, "Dot: one seed. Line: their mean.")
     return figure
 
