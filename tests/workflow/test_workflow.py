@@ -154,7 +154,6 @@ MODES = {  # options, with a file taken away before, and what the last lines the
     "--batch all=1/2": (None, "results/table1.tex"),
     "--summary": (None, "no update"),
     "--delete-all-output --dry-run": (None, "Would delete results/"),
-    "--report r.html": (None, "Report created"),
 }
 
 
@@ -173,6 +172,17 @@ def test_the_last_lines_are_true_in_each_of_snakemake_s_modes(finished: Project,
     last = output.partition("Table 1: ")[2] or output[output.rfind("Complete log") :]
     for path in re.findall(r"results/\S+\.\w+(?=,|\n)", last.partition("Not there")[0]):
         assert finished[path].exists() and path != f"results/{name}"
+
+
+def test_the_report_has_each_picture_with_a_caption_of_its_own(finished: Project) -> None:
+    code, output = finished("snakemake all --report r.html")
+    assert code == 0 and "Report created" in output and "Traceback" not in output
+    report = finished["r.html"].read_text(encoding="utf-8")
+    names = [path.stem for path in finished["results"].glob("*.png")]
+    captions = [finished[f"workflow/report/{name}.rst"].read_text() for name in names]
+    said = [re.search(r"[A-Za-z ]{15,}", caption)[0] for caption in captions]
+    assert len({*said}) == len(names) >= 4
+    assert [words for words in said if words not in report] == []
 
 
 CONFIG, PPO = "config.yaml", "src/mace_rl/agent/ppo.py"
