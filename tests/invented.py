@@ -14,8 +14,14 @@ from mace_study.compare.claims_config import parse_claims, parts_of
 from mace_study.compare.ledger import Finding
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
-from mace_study.measure.betas import BEFORE, CORRELATION
-from mace_study.measure.metrics import LearningCurve, Metric, final_return, metrics_columns
+from mace_study.measure.metrics import (
+    BEFORE,
+    CORRELATION,
+    LearningCurve,
+    Metric,
+    final_return,
+    metrics_columns,
+)
 
 SETTINGS = {"final_fraction": 0.1, "threshold": 0.75, "moving_average": 50, "comparisons": []}
 SETTINGS |= {"convergence_slope": 0.1, "confidence": 0.95}

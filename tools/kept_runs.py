@@ -5,7 +5,9 @@
 
 FOLDER/ENVIRONMENT.parquet has a row for each run, a group of rows for each variant. Of a run are
 kept its `run.json` and the columns of `episodes.csv` that tables read (`COLUMNS`), each as a list.
-Packing again adds runs to those that are there; equal runs give equal files.
+Where a return follows from how an episode ended and when, as Acrobot's does, the file's metadata
+have these returns instead. Packing again adds runs to those that are there; equal runs give equal
+files.
 """
 
 import argparse
@@ -39,6 +41,9 @@ COLUMNS = {
     "terminated": np.int64,
 }
 SMALLER = {"length": pa.int32(), "terminated": pa.bool_()}  # in the file
+END, RETURN = ["length", "terminated"], "extrinsic_return"
+FOLLOWS = b"extrinsic_return by length and terminated"  # key of the metadata
+REPEATED = 0.5  # of a column's numbers are different ones: with fewer a dictionary is smaller
 
 
 class Kept(NamedTuple):
@@ -56,17 +61,23 @@ def read(path: Path, variants: Collection[str] | None = None) -> Runs:
     chosen = None if variants is None else [("variant", "in", sorted(variants))]
     try:
         table = parquet.read_table(path, filters=chosen, page_checksum_verification=True)
-        columns = {name: _lists(table.column(name), kind) for name, kind in COLUMNS.items()}
+        columns = {
+            name: _lists(table.column(name), kind)
+            for name, kind in COLUMNS.items()
+            if name in table.column_names
+        }
+        if follows := (table.schema.metadata or {}).get(FOLLOWS):
+            columns[RETURN] = _returns(json.loads(follows), *(columns[name] for name in END))
         rows = zip(
             *(table.column(name).to_pylist() for name in ("variant", "seed", "record", "digest")),
-            *columns.values(),
+            *(columns[name] for name in COLUMNS),
             strict=True,
         )
         found: Runs = {}
         for variant, seed, record, digest, *lists in rows:
             if _digest(lists) != digest:
                 raise ValueError(f"{variant} seed {seed} has other episodes (SHA-256 differs)")
-            found[variant, seed] = Kept(record, _frame(dict(zip(columns, lists, strict=True))))
+            found[variant, seed] = Kept(record, _frame(dict(zip(COLUMNS, lists, strict=True))))
         return found
     except (ValueError, LookupError, OSError) as error:  # pyarrow's own are among these
         raise ValueError(f"{path} is not as a packed one is: {error}") from None
@@ -80,6 +91,16 @@ def _lists(column: pa.ChunkedArray, kind: type) -> list[np.ndarray]:
     numbers = _doubles(values) if single else values.to_numpy(zero_copy_only=False).astype(kind)
     ends = np.cumsum(pc.list_value_length(lists).to_numpy())
     return np.split(numbers, ends)[:-1]
+
+
+def _returns(
+    follows: list[list[float]], lengths: list[np.ndarray], terminated: list[np.ndarray]
+) -> list[np.ndarray]:
+    """The return of each episode; follows: length, whether it terminated, and its return."""
+    known = np.zeros((1 + max(int(length) for length, *_ in follows), 2))
+    for length, end, value in follows:
+        known[int(length), int(end)] = value
+    return [known[length, end] for length, end in zip(lengths, terminated, strict=True)]
 
 
 def _doubles(single: pa.Array) -> np.ndarray:
@@ -112,17 +133,27 @@ def write(path: Path, runs: Runs) -> None:
         "record": [run.record for run in runs.values()],
         "digest": digests,
     }
-    table = pa.table(keys | {name: _packed(name, lists) for name, lists in columns.items()})
-    split = [f"{name}.list.element" for name in ("length", "extrinsic_return", "beta")]
-    encodings: dict[str, str] = dict.fromkeys(split, "BYTE_STREAM_SPLIT")
+    together = pd.DataFrame({name: np.concatenate(columns[name]) for name in [*END, RETURN]})
+    together["bits"] = together[RETURN].to_numpy().view(np.int64)  # 0.0 and -0.0 are two
+    pairs = together.drop_duplicates([*END, "bits"])
+    follows = not pairs.duplicated(END).any()
+    kept = [name for name in columns if name != RETURN or not follows]
+    table = pa.table(keys | {name: _packed(name, columns[name]) for name in kept})
+    if follows:
+        table = table.replace_schema_metadata(
+            {FOLLOWS: json.dumps(pairs[[*END, RETURN]].to_numpy().tolist())}
+        )
+    coded = together["bits"].nunique() < REPEATED * len(together)
+    split = [name for name in kept if name != "terminated" and not (name == RETURN and coded)]
     sink = pa.BufferOutputStream()
     with parquet.ParquetWriter(
         sink,
         table.schema,
         compression="brotli",
         compression_level=11,
-        use_dictionary=["variant"],
-        column_encoding=encodings,
+        use_dictionary=["variant", *([f"{RETURN}.list.element"] if coded and not follows else [])],
+        column_encoding={f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in split},
+        write_statistics=["variant"],  # by which variants are found
         write_page_checksum=True,
     ) as file:
         for variant in dict.fromkeys(keys["variant"]):

@@ -16,12 +16,13 @@ from mace_rl.base import files
 from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
 from mace_study.compare import ceiling
-from mace_study.compare.claims_config import parse_claims
+from mace_study.compare.claims_config import parse_claims, parts_of
 from mace_study.compare.comparisons import ALL, comparisons
 from mace_study.compare.specification import MOVES, alone, asked_beta, in_tasks, specification
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
 from mace_study.measure.betas import betas_table
+from mace_study.measure.metrics import OF_BETAS
 from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import worlds
 from mace_study.show.curves import save_figure
@@ -65,12 +66,14 @@ def config_of(run: kept_runs.Kept) -> RunConfig:
 class Measured(NamedTuple):
     """The runs of a variant in one environment."""
 
-    rows: pd.DataFrame  # of metrics.csv and betas.csv
+    rows: pd.DataFrame  # of metrics.csv and, as far as claims ask for them, betas.csv
     deviations: list[float]  # how far the β that is asked for deviates, of each
     first: dict[int, float]  # by seed the mean return of the episodes that the ceiling is about
 
 
-def measured(path: Path, variant: str, seeds: range, settings: MetricsConfig) -> Measured | None:
+def measured(
+    path: Path, variant: str, seeds: range, settings: MetricsConfig, of_betas: Sequence[str]
+) -> Measured | None:
     """A variant's runs; None where some are lacking."""
     there = kept_runs.read(path, [variant])
     if not {(variant, seed) for seed in seeds} <= {*there}:
@@ -82,7 +85,7 @@ def measured(path: Path, variant: str, seeds: range, settings: MetricsConfig) ->
         first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
         if variant in READINGS:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
-    both = metrics_table(frames, settings), betas_table(frames, settings)
+    both = metrics_table(frames, settings), betas_table(frames, settings, of_betas)
     return Measured(both[0].merge(both[1], on=["env", "variant", "seed"]), moved, first)
 
 
@@ -91,12 +94,16 @@ def asked(
     seeds: Mapping[str, range],
     settings: MetricsConfig,
     baselines: Sequence[str],
+    of_betas: Sequence[str] = (),
 ) -> dict[tuple[str, str], Measured]:
-    """By environment and variant the runs of baselines and of the readings that have them all."""
+    """By environment and variant the runs of baselines and of the readings that have them all.
+
+    of_betas: the columns of betas.csv that claims ask for.
+    """
     jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
     made = {
         (env, name): measured(
-            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings
+            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings, of_betas
         )
         for env, name in jobs
     }
@@ -142,9 +149,11 @@ def make(kept: Path, goal: Path) -> list[str]:
     if not all((kept / place).exists() for place, _ in WORLDS.values()):
         return []
     study = read_study([CONFIG])
+    families = parse_claims(ROOT / study.claims).families.values()
+    compared_betas = {part.metric for own in families for _, part in parts_of(own)} & {*OF_BETAS}
     found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
-        runs = asked(kept / place, seeds, study.metrics, BASELINES)
+        runs = asked(kept / place, seeds, study.metrics, BASELINES, sorted(compared_betas))
         table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
         by_reading: dict[str, list[float]] = {}
         for (_, name), of_env in runs.items():

@@ -5,9 +5,9 @@
 Of the kept runs of each of `STUDIES` are made, in results/tables/STUDY, its tables and pictures, by
 the functions that the workflow's rules call, and README.md: tables.md with these pictures. What the
 worlds of reference/worlds/protocol.md say together comes into results/tables/worlds, and what they
-say of every reading of the learned β into results/tables/readings. Pictures are reduced to 256
-colours. All is compared with reference/tables. New files are kept there, and README.md, which only
-shows the others, is renewed; with --check both are mistakes.
+say of every reading of the learned β into results/tables/readings. All is compared with
+reference/tables. New files are kept there, and README.md, which only shows the others, is renewed;
+with --check both are mistakes.
 """
 
 import argparse
@@ -25,7 +25,6 @@ from typing import Any
 import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
 
 import pandas as pd
-from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from mace_rl.base import files
@@ -36,6 +35,7 @@ from mace_rl.training.records import RunKey
 from mace_study import results
 from mace_study.config.study import load_study
 from mace_study.plan import FIGURES, Plan
+from mace_study.show import curves  # noqa: F401  (what draws: once, not in each process)
 from tools import kept_runs, specification, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -123,17 +123,6 @@ def write_readme(name: str) -> None:
     (MADE / name / README).write_text(re.sub("^# .*", f"# {name}", text), encoding="utf-8")
 
 
-def reduce_colours(picture: Path) -> None:
-    """Keep 256 colours of a PNG file that cover all of its own, in less than half the bytes.
-
-    Those that are nearest on average would leave out a dot of a colour that is nowhere else.
-    """
-    with Image.open(picture) as image:
-        how = Image.Quantize.MAXCOVERAGE
-        reduced = image.convert("RGB").quantize(256, how, dither=Image.Dither.NONE)
-    reduced.save(picture, optimize=True)
-
-
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
     """The outputs that are not those in `EXPECTED`, where new ones and pages go, unless `check`."""
     different = []
@@ -179,14 +168,11 @@ def main() -> None:
         outputs[worlds.FOLDER] = together
     if asked:
         outputs[READINGS] = asked
-    every = [MADE / name / output for name, own in outputs.items() for output in own]
-    with ProcessPoolExecutor(cores) as pool:
-        list(pool.map(reduce_colours, [path for path in every if path.suffix == ".png"]))
     different = [
         path for name in outputs for path in difference(name, outputs[name], arguments.check)
     ]
-    runs = sum(count for count, _ in made.values())
-    print(f"{len(every)} tables and figures of {len(made)} studies from {runs} runs, in {MADE}")
+    count, runs = sum(map(len, outputs.values())), sum(runs for runs, _ in made.values())
+    print(f"{count} tables and figures of {len(made)} studies from {runs} runs, in {MADE}")
     if different:
         sys.exit("tables: not those that are kept: " + ", ".join(different))
 

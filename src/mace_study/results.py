@@ -47,7 +47,8 @@ def measure(
     """
     from mace_study.show.curves import mean_curves, quantity, seed_curves  # draws: a second
 
-    write_table(folder / "metrics.csv", metrics_table(frames, settings))
+    table = metrics_table(frames, settings)
+    write_table(folder / "metrics.csv", table)
     write_table(folder / "betas.csv", betas_table(frames, settings))
     for figure in figures:
         shown = quantity(figure.removeprefix("figure"), settings)
@@ -55,7 +56,7 @@ def measure(
         write_table(folder / f"{figure}_seeds.csv", seeds)
         write_table(folder / f"{figure}.csv", mean_curves(seeds, shown, settings))
     if paper is not None:
-        write_table(folder / "readings.csv", readings(frames, settings, paper.table1))
+        write_table(folder / "readings.csv", readings(frames, table, settings, paper.table1))
 
 
 def tabulate(

@@ -75,6 +75,28 @@ def test_six_digits_of_any_size_are_exact(tmp_path: Path) -> None:
     assert (episodes["beta"] == betas).all() and (episodes["extrinsic_return"] == returns).all()
 
 
+@pytest.mark.parametrize(
+    ("returns", "stored"),
+    [
+        (lambda length, ended: 0.1 * length * ended - 0.3, False),  # follows from how it ended
+        (lambda length, ended: np.tile([1 / 3, -0.0, 1 / 7, 0.1], 500), True),
+        (lambda length, ended: np.random.default_rng(1).normal(size=2000), True),
+        (lambda length, ended: -length.astype(float), False),
+        (lambda length, ended: np.where(length < 9, -0.0, 0.0), False),
+        (lambda length, ended: np.tile([-0.0, 0.0], 1000), True),  # two numbers
+    ],
+)
+def test_returns_that_follow_or_repeat_come_out_to_the_bit(tmp_path, returns, stored) -> None:
+    columns = episode_columns(2000, seed=1)
+    own = returns(columns["length"], columns["terminated"])
+    make_run(tmp_path / "results/runs/A-v1/ppo/seed1", 1, episodes=2000, extrinsic_return=own)
+    kept_runs.pack(tmp_path / "results", tmp_path / "kept")
+    path = tmp_path / "kept/A-v1.parquet"
+    ((_, episodes),) = kept_runs.read(path).values()
+    assert episodes["extrinsic_return"].to_numpy().tobytes() == own.tobytes()
+    assert ("extrinsic_return" in pd.read_parquet(path)) == stored
+
+
 def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
     for half in (0, 1):
         make_run(tmp_path / f"half{half}/runs/A-v1/ppo/seed{half}", half)

@@ -26,7 +26,9 @@ def test_betas_are_measured_like_returns(tmp_path):
     result.to_csv(tmp_path / "betas.csv", index=False)
     read = read_table(tmp_path / "betas.csv", b.betas_columns(CONFIG))
     pd.testing.assert_frame_equal(read, result)
-    assert b.stagnation_correlation(noisy(0), np.full(400, 0.4), 50) == 0  # β that is constant
+    one = b.betas_table(found, CONFIG, ["stagnation_correlation_before"])
+    pd.testing.assert_frame_equal(one, result[one.columns])
+    assert b.in_all(curve(noisy(0)), np.full(400, 0.4)) == 0  # β that is constant
 
 
 def by_hand(returns, betas, window, episodes):
@@ -46,7 +48,7 @@ def test_stagnation_before_and_after_the_bar_from_the_first_windows_on(window):
 
     def found(betas, goal=100.0):
         run = curve(returns[: len(betas)], random=0, goals=(goal,), moving_average=window)
-        return b.stagnation_correlations(run, betas)
+        return b.before(run, betas), b.after(run, betas)
 
     reached = min(t for t, mean in averages(returns, window).items() if mean >= 75)
     first = 2 * ((window + 9) // 10)

@@ -18,6 +18,7 @@ from invented import (
     table_for_questions,
     table_for_scores,
 )
+from PIL import Image
 from shared import illegible
 
 from mace_study.compare.ledger import Answer
@@ -159,6 +160,17 @@ def test_the_same_data_gives_the_same_file_and_another_colour_does_not(tmp_path,
     if kind == "pdf":  # vectors, and fonts that journals take
         assert b"/FontFile2" in contents[0]
         assert not any(word in contents[0] for word in (b"/Type3", b"/Subtype /Image", b"Creat"))
+
+
+def test_a_picture_in_256_colours_looks_the_same():
+    draws = np.random.default_rng(0)
+    colours = np.full((200, 200, 3), 255, np.uint8)
+    colours[:100] = draws.integers(0, 256, (100, 200, 1))  # greys
+    colours[100:150, :, 2] = draws.integers(0, 256, (50, 200))
+    colours[180:184, 180:184] = 2, 158, 115  # a dot, as in a legend: nothing else is like it
+    picture = c.few_colours(Image.fromarray(colours).convert("RGBA"))
+    assert picture.mode == "P" and len(picture.getcolors()) <= 256
+    assert abs(np.asarray(picture.convert("RGB"), int) - colours).max() < 4
 
 
 def test_an_inset_shows_a_beginning_in_which_most_is_learned():

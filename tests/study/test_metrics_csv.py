@@ -49,7 +49,8 @@ def table(settings=CONFIG):
 
 def test_a_row_holds_each_metric_under_its_name():
     returns = np.concatenate([np.full(200, 20.0), np.full(800, 500.0)])
-    row = metrics_of_run(frame(returns, 9), ("CartPole-v1", "ppo", 4), CONFIG)
+    run = "CartPole-v1", "ppo", 4
+    row = metrics_of_run(frame(returns, 9), run, CONFIG, m.all_metrics(CONFIG))
     assert row == ROW
     assert list(row) == COLUMNS
 

@@ -7,6 +7,7 @@ from invented import CLAIMS, STUDY, frame
 
 from mace_study.compare import readings as r
 from mace_study.compare.statistics import logrank
+from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import tables
 from mace_study.show.curves import plot_style
@@ -29,13 +30,17 @@ def frames() -> Frames:
     return found
 
 
+def readings(frames: Frames, settings: MetricsConfig = STUDY.metrics) -> pd.DataFrame:
+    return r.readings(frames, metrics_table(frames, settings), settings, CLAIMS.table1)
+
+
 def select(table: pd.DataFrame, reading: str, source: str) -> pd.DataFrame:
     rows = table[(table["reading"] == reading) & (table["source"] == source)]
     return rows.set_index("variant")
 
 
 def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames) -> None:
-    table = r.readings(frames, STUDY.metrics, CLAIMS.table1)
+    table = readings(frames)
     runs = metrics_table(frames, STUDY.metrics)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     expected = runs.groupby("variant")["sample_efficiency_range"].mean()
@@ -73,8 +78,9 @@ def test_readings_of_runs_of_the_paper_and_of_shuffled_returns(frames) -> None:
 )
 def test_first_for_sure_is_who_is_ahead_of_every_other(means, p_values, expected) -> None:
     rows = pd.DataFrame({"variant": ["c", "a", "b"], "mean": means, "p_value": p_values})
-    found, sure = r.ranked(rows.assign(rank=rows["mean"].rank(method="min")))
-    assert (list(found["variant"]), sure) == (["a", "b", "c"], expected)
+    rows["rank"] = rows["mean"].rank(method="min")
+    found, sure = r.ranked(rows.to_dict("records"))
+    assert ([row["variant"] for row in found], sure) == (["a", "b", "c"], expected)
 
 
 def test_runs_that_never_got_there_are_censored_at_the_end() -> None:
@@ -86,7 +92,7 @@ def test_runs_that_never_got_there_are_censored_at_the_end() -> None:
             if variant == "ppo" or seed < 3:
                 returns[100 + seed :] = 450.0
             frames["CartPole-v1", variant, seed] = frame(returns)
-    table = r.readings(frames, STUDY.metrics, CLAIMS.table1)
+    table = readings(frames)
     rows = select(table, "sample_efficiency_range", r.RUNS)
     assert rows["censored"].to_dict() == {"ppo": 0, "mace_full": 3}
     runs = metrics_table(frames, STUDY.metrics).set_index("variant")
@@ -107,7 +113,7 @@ def test_a_longer_budget_makes_nobody_later(frames: Frames) -> None:
         returns = own["extrinsic_return"] * 0 + (20.0 if variant == "ppo" else late)
         new = frame(returns.to_numpy()[: 300 if variant == "ppo" else EPISODES])
         short[env, variant, seed] = new
-    rows = select(r.readings(short, STUDY.metrics, CLAIMS.table1), reading, r.RUNS)
+    rows = select(readings(short), reading, r.RUNS)
     assert rows["censored"].to_dict() == {"ppo": 6, "mace_fixed": 0, "mace_full": 0}
     assert set(rows["rank"]) == {1} and np.nanmin(rows["p_value"]) == 1
 
@@ -116,7 +122,7 @@ def test_an_environment_that_the_paper_has_not(frames: Frames) -> None:
     changes = {"random_return": {"Other-v0": 20.0}, "reference_return": {}}
     settings = STUDY.metrics.model_copy(update=changes)
     other = {("Other-v0", *run[1:]): frame for run, frame in frames.items()}
-    table = r.readings(other, settings, CLAIMS.table1)
+    table = readings(other, settings)
     assert set(table["source"]) == {r.RUNS, r.SHUFFLED}
     colours = {"ppo": "red", "mace_fixed": "green", "mace_full": "blue"}
     look = plot_style(settings, STUDY.figure.model_dump(), STUDY.labels, colours)

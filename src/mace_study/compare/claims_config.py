@@ -14,8 +14,7 @@ from mace_rl.config.section import ConfigError, Section, check, check_known
 from mace_study.compare.ledger import Answer
 from mace_study.config.labels import require_latex
 from mace_study.config.metrics import MetricsConfig, Names, once
-from mace_study.measure.betas import CORRELATIONS
-from mace_study.measure.metrics import METRICS, all_metrics
+from mace_study.measure.metrics import CORRELATIONS, METRICS, all_metrics
 
 if TYPE_CHECKING:  # imports Gymnasium, which tables do without
     from mace_study.config.study import Study

@@ -47,32 +47,37 @@ def shuffled(
 
 
 def readings(
-    frames: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig, table1: Table1Config
+    frames: Mapping[RunKey, pd.DataFrame],
+    table: pd.DataFrame,
+    settings: MetricsConfig,
+    table1: Table1Config,
 ) -> pd.DataFrame:
     """The data of readings.csv: one row per environment, reading, source and variant.
 
-    frames: `FinishedRun.episodes` of each run (environment, variant, seed). Columns: env,
+    frames: `FinishedRun.episodes` of each run (environment, variant, seed); table: their frame of
+    metrics.csv. Columns: env,
     kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
     variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
     mean, if training ended with the shortest budget of the environment's variants) and p_value: of
     the log-rank test, not corrected, of this variant against that of rank 1.
     """
-    found = kinds(settings, table1)
-    runs = {RUNS: metrics_table(frames, settings)}
-    runs[SHUFFLED] = metrics_table(shuffled(frames, settings), settings)
-    means = {source: summary(table, settings, table1) for source, table in runs.items()}
+    asked = kinds(settings, table1)
+    rules = [metric for _, metric in asked if metric.name in table1.public_code]
+    mixed = metrics_table(shuffled(frames, settings), settings, rules)
+    runs = {RUNS: table, SHUFFLED: mixed}
+    means = {source: summary(own, settings, table1) for source, own in runs.items()}
     parts = []
     for environment in dict.fromkeys(name for name, _, _ in frames):
-        for kind in dict.fromkeys(kind for kind, _ in found):
+        for kind in dict.fromkeys(kind for kind, _ in asked):
             parts.append(_published(environment, kind, list(frames), table1))
-        for (kind, metric), source in itertools.product(found, (RUNS, SHUFFLED)):
-            if source == RUNS or metric.name in table1.public_code:
+        for (kind, metric), source in itertools.product(asked, (RUNS, SHUFFLED)):
+            if source == RUNS or metric in rules:
                 both = means[source], runs[source]
-                rows, own = (table[table["env"] == environment] for table in both)
+                rows, own = (frame[frame["env"] == environment] for frame in both)
                 rows = _measured(rows[rows["metric"] == metric.name], own, metric, settings)
                 parts.append(rows.assign(kind=kind, source=source))
-    table = pd.concat(parts).rename(columns={"metric": "reading"})
-    return table[COLUMNS].reset_index(drop=True)
+    found = pd.concat(parts).rename(columns={"metric": "reading"})
+    return found[COLUMNS].reset_index(drop=True)
 
 
 def _published(
@@ -121,9 +126,9 @@ def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFra
     return sorted(lines, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
 
 
-def ranked(rows: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
+def ranked(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], bool]:
     """The rows in the order of their ranks, and whether the first place is more than chance."""
-    ordered = rows.sort_values("rank", kind="stable")
-    others = ordered["p_value"].iloc[1:]
-    sure = others.notna().any() and (others < LEVEL).all() and (ordered["rank"] == 1).sum() == 1
-    return ordered, bool(sure)
+    ordered = sorted(rows, key=lambda row: row["rank"])
+    others = [row["p_value"] for row in ordered[1:]]
+    alone = [row["rank"] for row in rows].count(1) == 1
+    return ordered, bool(others) and alone and all(p < LEVEL for p in others)

@@ -17,7 +17,7 @@ COLUMNS += ["paper"]  # of table1.csv and supplement.csv
 
 
 def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) -> pd.DataFrame:
-    """All metrics averaged over seeds; `table` is the frame of metrics.csv, `table1` the paper's.
+    """The metrics of `table`, a frame of metrics.csv, averaged over seeds; `table1`: the paper's.
 
     One row per environment, variant and metric, in the order of `table`. The interval (NaN with one
     seed) is cut to where the mean must lie. `censored`: how many of the seeds count with the budget
@@ -26,7 +26,7 @@ def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) 
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
-        for metric in all_metrics(settings):
+        for metric in (one for one in all_metrics(settings) if one.name in runs):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
             low, high = interval(values, settings)
             limits = {"episodes": (1, runs["episodes"].mean()), "share": (0, 1)}

@@ -1,7 +1,6 @@
 """betas.csv: where β ends, its range, and whether it is larger where learning stagnates."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,13 +8,20 @@ import scipy  # loads what is used of it when it is
 
 from mace_rl.training.records import RunKey
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure import metrics
+from mace_study.measure.metrics import (
+    AFTER,
+    BEFORE,
+    CORRELATION,
+    OF_BETAS,
+    LearningCurve,
+    final_return,
+    learning_curve,
+    sample_efficiency_common,
+)
 
 if TYPE_CHECKING:  # planning the workflow imports this module
     import pandas as pd
 
-# Columns beside β's own: in all of training, before and after the common bar.
-CORRELATIONS = CORRELATION, BEFORE, AFTER = metrics.CORRELATIONS
 LABELS = {  # of columns, in tables
     "beta_end": "β at the end",
     "beta_lowest": "lowest β",
@@ -25,73 +31,74 @@ LABELS = {  # of columns, in tables
 }
 
 
-def correlation_columns(settings: MetricsConfig) -> tuple[str, ...]:
-    """Those of `CORRELATIONS` that there are; without a common bar nothing is before or after."""
-    return CORRELATIONS if settings.reference_return else (CORRELATION,)
-
-
 def betas_columns(settings: MetricsConfig) -> dict[str, type]:
-    """The columns of betas.csv."""
-    values = dict.fromkeys([*metrics.OF_BETAS[:3], *correlation_columns(settings)], float)
-    return {"env": str, "variant": str, "seed": int} | values
+    """The columns of betas.csv; without a common bar nothing is before or after it."""
+    columns = OF_BETAS if settings.reference_return else OF_BETAS[:-2]
+    return {"env": str, "variant": str, "seed": int} | dict.fromkeys(columns, float)
 
 
-def betas_table(runs: Mapping[RunKey, "pd.DataFrame"], settings: MetricsConfig) -> "pd.DataFrame":
-    """The data of betas.csv: of each run β at its end, its range, its stagnation correlations."""
+def betas_table(
+    runs: Mapping[RunKey, "pd.DataFrame"],
+    settings: MetricsConfig,
+    columns: Iterable[str] | None = None,
+) -> "pd.DataFrame":
+    """The data of betas.csv: a row for each run, with all of its `columns` or these of `OF_BETAS`.
+
+    runs: the records of each.
+    """
     import pandas as pd
 
+    all_columns = list(betas_columns(settings))
+    key, wanted = all_columns[:3], all_columns[3:] if columns is None else list(columns)
     rows = []
     for run, frame in runs.items():
-        beta, returns = frame["beta"].to_numpy(), frame["extrinsic_return"].to_numpy()
-        end = metrics.final_return(beta, settings.final_fraction)
-        found = correlations(returns, beta, run[0], settings)
-        rows.append([*run, end, beta.min(), beta.max(), *found])
-    return pd.DataFrame(rows, columns=list(betas_columns(settings)))
+        curve = learning_curve(frame["extrinsic_return"].to_numpy(), run[0], settings)
+        betas = frame["beta"].to_numpy()
+        rows.append([*run, *(MEASURES[name](curve, betas) for name in wanted)])
+    return pd.DataFrame(rows, columns=[*key, *wanted])
 
 
-def correlations(
-    returns: np.ndarray, betas: np.ndarray, environment: str, settings: MetricsConfig
-) -> list[float]:
-    """The stagnation correlations of a run, as betas.csv has them; returns, betas: [E]."""
-    if np.ptp(betas) == 0:
-        return [0.0] * len(correlation_columns(settings))
-    curve = metrics.learning_curve(returns, environment, settings)
-    found = [stagnation_correlation(returns, betas, settings.moving_average)]
-    return [*found, *(stagnation_correlations(curve, betas) if settings.reference_return else ())]
-
-
-def stagnation_correlation(returns: np.ndarray, betas: np.ndarray, window: int) -> float:
+def in_all(curve: LearningCurve, betas: np.ndarray) -> float:
     """Spearman's correlation of stagnation with the β of the next episode; 0 if either is constant.
 
-    returns, betas: [E]. Stagnation is minus the `slope`.
+    betas: [E]. Stagnation is minus the `slopes`.
     """
-    return _correlation(-metrics.slope(returns, window), betas)
+    return 0.0 if np.ptp(betas) == 0 else _correlation(-curve.slopes, betas)
 
 
-def stagnation_correlations(curve: metrics.LearningCurve, betas: np.ndarray) -> tuple[float, float]:
-    """The same, by the `growing_slope`, before and after `sample_efficiency_common`.
+def before(curve: LearningCurve, betas: np.ndarray) -> float:
+    """The same, by the `growing_slopes`, before `sample_efficiency_common`.
 
     betas: [E]. An episode's stagnation and the next one's β are before that episode if both are.
     0, too, for a time of which there are fewer than two.
     """
-    reached = metrics.sample_efficiency_common(curve)
-    stagnation = -growing_slope(curve.returns, curve.settings.moving_average)
-    until = max(0, reached.number - len(betas) + len(stagnation))  # in place of episodes
-    before = _correlation(stagnation[:until], betas[: reached.number])
-    after = _correlation(stagnation[max(0, until - 1) :], betas)
-    return before, 0.0 if reached.censored else after
+    if np.ptp(betas) == 0:
+        return 0.0
+    reached = sample_efficiency_common(curve).number
+    return _correlation(-curve.growing_slopes[: _place(curve, reached)], betas[:reached])
 
 
-def growing_slope(returns: np.ndarray, window: int) -> np.ndarray:
-    """`slope` from episode 2 · ceil(window / 10) on: single episodes side by side are noise.
+def after(curve: LearningCurve, betas: np.ndarray) -> float:
+    """The same after `sample_efficiency_common`; 0 if it is never reached."""
+    reached = sample_efficiency_common(curve)
+    if np.ptp(betas) == 0 or reached.censored:
+        return 0.0
+    return _correlation(-curve.growing_slopes[max(0, _place(curve, reached.number) - 1) :], betas)
 
-    While there are no 2 windows, the halves of the episodes so far are compared.
-    """
-    first = 2 * math.ceil(window / 10)
-    ends = range(first, min(2 * window, len(returns) + 1))
-    halves = ((returns[t % 2 : t - t // 2], returns[t - t // 2 : t]) for t in ends)
-    growing = [(later.sum() - earlier.sum()) / len(later) ** 2 for earlier, later in halves]
-    return np.concatenate([growing, metrics.slope(returns, window)])
+
+MEASURES: Mapping[str, Callable[[LearningCurve, np.ndarray], float]] = {  # by `OF_BETAS`
+    "beta_end": lambda curve, betas: final_return(betas, curve.settings.final_fraction),
+    "beta_lowest": lambda _, betas: betas.min(),
+    "beta_highest": lambda _, betas: betas.max(),
+    CORRELATION: in_all,
+    BEFORE: before,
+    AFTER: after,
+}
+
+
+def _place(curve: LearningCurve, episode: int) -> int:
+    """How many of the `growing_slopes` come before the one of this episode."""
+    return max(0, episode - len(curve.returns) + len(curve.growing_slopes))
 
 
 def _correlation(stagnation: np.ndarray, betas: np.ndarray) -> float:

@@ -22,9 +22,11 @@ PUBLIC_CODE_FLOOR = 0.3  # [R] of training is skipped
 PUBLIC_CODE_SLOPE = 0.05  # [R] return per episode
 PUBLIC_CODE_LAST = 10  # [R] episodes whose mean sets the bar of sample efficiency
 
-# Of betas.csv, which claims are judged by beside metrics.csv.
+# Of betas.csv, which claims are judged by beside metrics.csv: in all of training, before and after
+# the common bar.
 CORRELATION = "stagnation_correlation"
-CORRELATIONS = CORRELATION, f"{CORRELATION}_before", f"{CORRELATION}_after"
+BEFORE, AFTER = f"{CORRELATION}_before", f"{CORRELATION}_after"
+CORRELATIONS = (CORRELATION, BEFORE, AFTER)
 OF_BETAS = ("beta_end", "beta_lowest", "beta_highest", *CORRELATIONS)
 COLUMN_TYPES = {"episodes": int, "return": float, "share": float}  # of metrics.csv, by unit
 
@@ -57,14 +59,32 @@ class LearningCurve:
         return bool(self.final - 2 * last.std() / math.sqrt(len(last)) > self.random_mean)
 
     @cached_property
+    def total(self) -> np.ndarray:
+        """The sum of each `window` consecutive returns, [E - window + 1]."""
+        return _moving_sum(self.returns, self.settings.moving_average)
+
+    @property
     def average(self) -> np.ndarray:
         """The `moving_average`, [E - window + 1]."""
-        return moving_average(self.returns, self.settings.moving_average)
+        return self.total / self.settings.moving_average
 
-    @cached_property
+    @property
     def slopes(self) -> np.ndarray:
         """Its `slope`, [E - 2 · window + 1]."""
-        return slope(self.returns, self.settings.moving_average)
+        return _slope(self.total, self.settings.moving_average)
+
+    @cached_property
+    def growing_slopes(self) -> np.ndarray:
+        """`slopes` from episode 2 · ceil(window / 10) on: single episodes side by side are noise.
+
+        While there are no 2 windows, the halves of the episodes so far are compared.
+        """
+        returns, window = self.returns, self.settings.moving_average
+        first = 2 * math.ceil(window / 10)
+        ends = range(first, min(2 * window, len(returns) + 1))
+        halves = ((returns[t % 2 : t - t // 2], returns[t - t // 2 : t]) for t in ends)
+        growing = [(later.sum() - earlier.sum()) / len(later) ** 2 for earlier, later in halves]
+        return np.concatenate([growing, self.slopes])
 
     def bar(self, goal: float) -> float:
         """The return `threshold` of the way from random actions to `goal`."""
@@ -120,8 +140,7 @@ def slope(returns: np.ndarray, window: int) -> np.ndarray:
     Entry i belongs to episode 2 · `window` + i and compares the last `window` episodes with the
     `window` before them. (From one episode to the next the average's change is noise.)
     """
-    total = _moving_sum(returns, window)
-    return (total[window:] - total[:-window]) / window**2
+    return _slope(_moving_sum(returns, window), window)
 
 
 def sample_efficiency(curve: LearningCurve) -> Attained:
@@ -296,3 +315,7 @@ def _moving_sum(values: np.ndarray, window: int) -> np.ndarray:
     if len(values) < window:
         return np.empty(0)
     return np.lib.stride_tricks.sliding_window_view(values, window).sum(axis=-1)
+
+
+def _slope(total: np.ndarray, window: int) -> np.ndarray:
+    return (total[window:] - total[:-window]) / window**2

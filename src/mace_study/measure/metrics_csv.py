@@ -29,22 +29,27 @@ WANTED = {  # of a metric, by its unit
 }
 
 
-def metrics_table(runs: Mapping[RunKey, pd.DataFrame], settings: MetricsConfig) -> pd.DataFrame:
-    """One row of `metrics_columns` per run, in the order of `runs`."""
-    table = pd.DataFrame([metrics_of_run(frame, run, settings) for run, frame in runs.items()])
-    _check_attained("the table of metrics", table, all_metrics(settings))
+def metrics_table(
+    runs: Mapping[RunKey, pd.DataFrame],
+    settings: MetricsConfig,
+    metrics: Sequence[Metric] | None = None,
+) -> pd.DataFrame:
+    """One row of `metrics_columns` per run, in the order of `runs`, with all metrics or these."""
+    metrics = all_metrics(settings) if metrics is None else metrics
+    rows = [metrics_of_run(frame, run, settings, metrics) for run, frame in runs.items()]
+    table = pd.DataFrame(rows)
+    _check_attained("the table of metrics", table, metrics)
     return table
 
 
 def metrics_of_run(
-    frame: pd.DataFrame, run: RunKey, settings: MetricsConfig
+    frame: pd.DataFrame, run: RunKey, settings: MetricsConfig, metrics: Sequence[Metric]
 ) -> dict[str, str | int | float]:
     """The row of metrics.csv of one run, from its records."""
     environment, variant, seed = run
     curve = learning_curve(frame["extrinsic_return"].to_numpy(), environment, settings)
     row: dict[str, str | int | float] = {"env": environment, "variant": variant, "seed": seed}
     row |= {"episodes": len(curve.returns), "env_steps": int(frame["env_steps"].iloc[-1])}
-    metrics = all_metrics(settings)
     for metric in metrics:
         value: Any = metric.function(curve)
         if not _fits(value, metric.unit):

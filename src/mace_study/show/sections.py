@@ -13,7 +13,8 @@ from mace_study.compare.comparisons import ALL
 from mace_study.compare.ledger import Answer
 from mace_study.compare.summary import from_to
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.betas import CORRELATIONS, LABELS, betas_columns
+from mace_study.measure.betas import LABELS, betas_columns
+from mace_study.measure.metrics import CORRELATIONS
 from mace_study.measure.metrics_csv import read_metrics
 from mace_study.show import tables
 

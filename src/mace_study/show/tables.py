@@ -14,8 +14,8 @@ from mace_study.compare.readings import in_order, ranked, title
 from mace_study.compare.statistics import interval
 from mace_study.compare.summary import digits_by_metric
 from mace_study.config.metrics import MetricsConfig
-from mace_study.measure.betas import CORRELATIONS, LABELS
-from mace_study.measure.metrics import metric_labels, metric_units
+from mace_study.measure.betas import LABELS
+from mace_study.measure.metrics import CORRELATIONS, metric_labels, metric_units
 
 COLUMNS_PER_BLOCK = 3  # of LaTeX and the terminal, side by side; more continue below
 DASH = "\u2013"  # in the place of a number that there is not
@@ -27,6 +27,8 @@ CENSORED = (
 )
 POWERS = "⁻⁰\u00b9\u00b2\u00b3⁴⁵⁶⁷⁸⁹"
 SOLVED = 0.9  # of the last episodes, for a seed to count
+
+Row = Mapping[str, Any]  # of a frame, by its columns
 
 
 class Value(NamedTuple):
@@ -60,6 +62,12 @@ def estimate(value: Iterable[Any], digits: int, mark: str = "", best: bool = Fal
     return Value(text, low, high, mark, best)
 
 
+def records(table: pd.DataFrame) -> list[Row]:
+    """The rows of a frame."""
+    found: list[Any] = table.to_dict("records")
+    return found
+
+
 def named(table: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
     """A study's data with other names of its variants."""
     columns = table.columns.intersection(["variant", "baseline"])
@@ -79,11 +87,11 @@ def table1(table: pd.DataFrame, settings: MetricsConfig, paper: Table1Config) ->
         first = means.min() if units[str(metric)] == "episodes" else means.max()
         best[env, metric] = number(first, digits[str(env), str(metric)])
 
-    def cell(runs: pd.DataFrame) -> Cell:
-        values, published = [], []
-        for metric in paper.metrics:
-            row = runs[runs["metric"] == metric].iloc[0]
-            key = row["env"], metric
+    def cell(rows: Sequence[Row]) -> Cell:
+        values, published = [], list[str]()
+        by_metric = {row["metric"]: row for row in rows}
+        for row in map(by_metric.__getitem__, paper.metrics):
+            key = row["env"], row["metric"]
             shown = number(row["mean"], digits[key])
             is_best = row["censored"] < row["seeds"] and shown == best[key]
             values.append(_mean(row, digits[key], is_best))
@@ -103,9 +111,8 @@ def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.Dat
     digits = digits_by_metric(table, settings)
     labelled = table.assign(label=table["metric"].map(metric_labels(settings)))
 
-    def cell(rows: pd.DataFrame) -> Cell:
-        values = [_mean(row, digits[row["env"], row["metric"]]) for _, row in rows.iterrows()]
-        return Cell(values)
+    def cell(rows: Sequence[Row]) -> Cell:
+        return Cell([_mean(row, digits[row["env"], row["metric"]]) for row in rows])
 
     groups = labelled.groupby("env", sort=False)
     return {str(env): _grid(own, cell, rows="label", columns="variant") for env, own in groups}
@@ -114,25 +121,25 @@ def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.Dat
 def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
     """One metric of a `summary`, a row for each variant and a column for each environment."""
     digits, own = digits_by_metric(table, settings), table[table["metric"] == metric]
-    return _grid(own, lambda rows: Cell([_mean(rows.iloc[0], digits[rows["env"].iloc[0], metric])]))
+    return _grid(own, lambda rows: Cell([_mean(rows[0], digits[rows[0]["env"], metric])]))
 
 
 def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The final return of each variant's worst seed, from the frame of metrics.csv."""
     table = runs.assign(metric="final_return", mean=runs["final_return"])
     digits = {env: count for (env, _), count in digits_by_metric(table, settings).items()}
-    return _grid(table, lambda own: number(own["mean"].min(), digits[own["env"].iloc[0]]))
+    return _grid(table, lambda own: number(min(run["mean"] for run in own), digits[own[0]["env"]]))
 
 
 def solved(runs: pd.DataFrame) -> pd.DataFrame:
     """How many seeds solve each task, from the frame of metrics.csv."""
-    return _grid(runs, lambda own: f"{int((own['solved'] >= SOLVED).sum())} of {len(own)}")
+    return _grid(runs, lambda own: f"{sum(run['solved'] >= SOLVED for run in own)} of {len(own)}")
 
 
 def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """comparisons.csv in single environments, with as many digits as `means`, a `summary`, has."""
     digits, rows = digits_by_metric(means, settings), []
-    for _, row in table.iterrows():
+    for row in records(table):
         shown = digits[row["env"], row["metric"]]
         own = [row["env"], f"{row['variant']} over {row['baseline']}", number(row["seeds"])]
         own += [_estimate(row, "difference", shown, ends="")]
@@ -145,13 +152,13 @@ def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
     """The probabilities of comparisons.csv: a row for each pair, a column for each environment."""
     own = table.assign(pair=table["variant"] + " over " + table["baseline"])
     own = own[own["metric"] == metric]
-    return _grid(own, lambda rows: _estimate(rows.iloc[0], "probability", 2), rows="pair")
+    return _grid(own, lambda rows: _estimate(rows[0], "probability", 2), rows="pair")
 
 
 def aggregate(table: pd.DataFrame) -> pd.DataFrame:
     """aggregate.csv."""
     rows = []
-    for _, row in table.iterrows():
+    for row in records(table):
         own = [row["variant"], row["metric"].replace("_", " "), number(row["runs"])]
         rows.append([*own, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
     return pd.DataFrame(rows, columns=["", "score of", "runs", "mean", "interquartile mean"])
@@ -163,11 +170,11 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     The best is a first place that is more than chance (`ranked`).
     """
 
-    def cell(rows: pd.DataFrame) -> Cell:
+    def cell(rows: Sequence[Row]) -> Cell:
         ordered, is_first = ranked(rows)
         values = [
             Value(f"{row['variant']} {number(row['mean'])}", mark="†" if row["censored"] else "")
-            for _, row in ordered.iterrows()
+            for row in ordered
         ]
         return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
 
@@ -237,11 +244,11 @@ def side_by_side(studies: Mapping[str, Sequence[Answer]], how: str) -> pd.DataFr
     columns = []
     for answers in studies.values():
         frame = parts(answers, how).set_index(["", "environment", "metric", "over"])
-        columns.append(pd.Series([_in_short(row) for _, row in frame.iterrows()], frame.index))
+        columns.append(pd.Series(list(map(_in_short, records(frame))), frame.index))
     return pd.concat(columns, axis=1, keys=studies, sort=False).fillna("").reset_index()
 
 
-def _in_short(part: pd.Series) -> Cell:
+def _in_short(part: Row) -> Cell:
     size = f", {part['size']}" if part["outcome"] in ("shown", "reversed") else ""
     numbers = (f"{name} {part[name]}" for name in ("n", *SIZES))
     return part["difference"]._replace(note=f"{', '.join(numbers)}: {part['outcome']}{size}")
@@ -259,13 +266,15 @@ def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
 
 def _grid(
     table: pd.DataFrame,
-    cell: Callable[[pd.DataFrame], str | Cell],
+    cell: Callable[[Sequence[Row]], str | Cell],
     head: str = "",
     rows: str = "variant",
     columns: str = "env",
 ) -> pd.DataFrame:
     """A row for each of `rows` and a column for each of `columns`; empty where there is nothing."""
-    groups = dict(list(table.groupby([rows, columns], sort=False)))
+    groups: dict[Any, list[Row]] = {}
+    for row in records(table):
+        groups.setdefault((row[rows], row[columns]), []).append(row)
     across = list(table[columns].unique())
     lines = [
         [name, *(cell(groups[name, other]) if (name, other) in groups else "" for other in across)]
@@ -274,13 +283,13 @@ def _grid(
     return pd.DataFrame(lines, columns=[head, *across])
 
 
-def _mean(row: pd.Series, digits: int, best: bool = False) -> Value:
+def _mean(row: Row, digits: int, best: bool = False) -> Value:
     """A row of a `summary`, with the number of seeds that never got there."""
     mark = f"†{row['censored']}" if row["censored"] else ""
-    return estimate(row[["mean", "low", "high"]], digits, mark, best)
+    return estimate((row["mean"], row["low"], row["high"]), digits, mark, best)
 
 
-def _estimate(row: Any, name: str, digits: int, ends: str | None = None) -> Cell:
+def _estimate(row: Row, name: str, digits: int, ends: str | None = None) -> Cell:
     """The value `name` of a row, whose interval is `ends` low and high: as a rule NAME_low."""
     prefix = f"{name}_" if ends is None else ends
     return Cell([estimate((row[name], row[f"{prefix}low"], row[f"{prefix}high"]), digits)])
