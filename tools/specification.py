@@ -5,7 +5,7 @@ A part of `make tables`. Only a reading all of whose runs are kept is asked.
 
 import json
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from mace_study.compare.specification import MOVES, alone, asked_beta, in_tasks,
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
 from mace_study.measure.betas import betas_table
-from mace_study.measure.metrics import OF_BETAS
+from mace_study.measure.metrics import OF_BETAS, all_metrics, metric_units
 from mace_study.measure.metrics_csv import metrics_table
 from mace_study.show import worlds
 from mace_study.show.curves import save_figure
@@ -66,15 +66,15 @@ def config_of(run: kept_runs.Kept) -> RunConfig:
 class Measured(NamedTuple):
     """The runs of a variant in one environment."""
 
-    rows: pd.DataFrame  # of metrics.csv and, as far as claims ask for them, betas.csv
+    rows: pd.DataFrame  # of metrics.csv and betas.csv, the columns that are asked for
     deviations: list[float]  # how far the β that is asked for deviates, of each
     first: dict[int, float]  # by seed the mean return of the episodes that the ceiling is about
 
 
 def measured(
-    path: Path, variant: str, seeds: range, settings: MetricsConfig, of_betas: Sequence[str]
+    path: Path, variant: str, seeds: range, settings: MetricsConfig, columns: Collection[str]
 ) -> Measured | None:
-    """A variant's runs; None where some are lacking."""
+    """A variant's runs; None where some are lacking. columns: of metrics.csv and betas.csv."""
     there = kept_runs.read(path, [variant])
     if not {(variant, seed) for seed in seeds} <= {*there}:
         return None
@@ -85,8 +85,11 @@ def measured(
         first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
         if variant in READINGS:
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
-    both = metrics_table(frames, settings), betas_table(frames, settings, of_betas)
-    return Measured(both[0].merge(both[1], on=["env", "variant", "seed"]), moved, first)
+    metrics = [metric for metric in all_metrics(settings) if metric.name in columns]
+    rows = metrics_table(frames, settings, metrics)
+    if of_betas := [name for name in OF_BETAS if name in columns]:
+        rows = rows.merge(betas_table(frames, settings, of_betas), on=["env", "variant", "seed"])
+    return Measured(rows, moved, first)
 
 
 def asked(
@@ -94,16 +97,16 @@ def asked(
     seeds: Mapping[str, range],
     settings: MetricsConfig,
     baselines: Sequence[str],
-    of_betas: Sequence[str] = (),
+    columns: Collection[str],
 ) -> dict[tuple[str, str], Measured]:
     """By environment and variant the runs of baselines and of the readings that have them all.
 
-    of_betas: the columns of betas.csv that claims ask for.
+    columns: as of `measured`.
     """
     jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
     made = {
         (env, name): measured(
-            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings, of_betas
+            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings, columns
         )
         for env, name in jobs
     }
@@ -123,7 +126,7 @@ def in_our_tasks(kept: Path) -> pd.DataFrame:
         [family] = alone(parse_claims(path), claim).families.values()
         [part] = family.claims[claim].parts[DECIDES]
         each = dict.fromkeys(part.environments, seeds)
-        runs = asked(kept / layers[-1], each, study.metrics, part.over)
+        runs = asked(kept / layers[-1], each, study.metrics, part.over, [part.metric])
         table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
         readings = [name for name in READINGS if name in set(table["variant"])]
         found.append(in_tasks(table, study.metrics, path, readings, claim, DECIDES))
@@ -150,10 +153,11 @@ def make(kept: Path, goal: Path) -> list[str]:
         return []
     study = read_study([CONFIG])
     families = parse_claims(ROOT / study.claims).families.values()
-    compared_betas = {part.metric for own in families for _, part in parts_of(own)} & {*OF_BETAS}
+    columns = {part.metric for family in families for _, part in parts_of(family)}
+    columns |= {*metric_units(study.metrics)}  # to compare
     found, compared, moved, earned = [], [], {}, []
     for world, (place, seeds) in WORLDS.items():
-        runs = asked(kept / place, seeds, study.metrics, BASELINES, sorted(compared_betas))
+        runs = asked(kept / place, seeds, study.metrics, BASELINES, columns)
         table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
         by_reading: dict[str, list[float]] = {}
         for (_, name), of_env in runs.items():
@@ -163,11 +167,11 @@ def make(kept: Path, goal: Path) -> list[str]:
         }
         first = {job: of_env.first for job, of_env in runs.items()}
         earned.append(ceiling.over_ppo(first, study.metrics).assign(world=world))
-        own = specification(table, study.metrics, ROOT / study.claims, moved[world], DECIDES)
-        found.append(own.assign(world=world))
+        answers = specification(table, study.metrics, ROOT / study.claims, moved[world], DECIDES)
+        found.append(answers.assign(world=world))
         pairs = [[name, other] for name in moved[world] for other in BASELINES]
-        own = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
-        compared.append(own[own["env"] != ALL].assign(world=world))
+        over = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
+        compared.append(over[over["env"] != ALL].assign(world=world))
     forks, metrics = pd.read_csv(CEILING), read_study([CONFIG, *CONTROLS]).metrics
     tables = {
         "specification": pd.concat(found, ignore_index=True),
@@ -200,8 +204,8 @@ def make(kept: Path, goal: Path) -> list[str]:
 def of_oracle(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """What the oracle and β = 0.4 earn over PPO with the seeds of the ceiling, as `over_ppo`."""
     found = []
-    for (world, horizon), own in rows.groupby(["world", "episodes"], sort=False):
-        named = own.assign(who=own["who"].replace("oracle", f"oracle, H = {horizon}"))
+    for (world, horizon), forks in rows.groupby(["world", "episodes"], sort=False):
+        named = forks.assign(who=forks["who"].replace("oracle", f"oracle, H = {horizon}"))
         single = named.drop_duplicates(["env", "who", "seed"])
         means = {
             (str(env), str(who)): dict(zip(each["seed"], each["mean_return"], strict=True))
@@ -272,12 +276,14 @@ ORIGIN = "By `make tables`, from the runs of [the protocol](../../readings/proto
 def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
     """The tables of the page: the answers world by world, and how much β moves."""
     found = []
-    for world, own in answers.groupby("world", sort=False):
-        said = own["verdict"].where(own["whole"], own["verdict"] + " †")
-        wide = own.assign(verdict=said).pivot(index="claim", columns="reading", values="verdict")
-        order = own[["claim", "statement"]].drop_duplicates("claim")
+    for world, of_world in answers.groupby("world", sort=False):
+        said = of_world["verdict"].where(of_world["whole"], of_world["verdict"] + " †")
+        wide = of_world.assign(verdict=said).pivot(
+            index="claim", columns="reading", values="verdict"
+        )
+        order = of_world[["claim", "statement"]].drop_duplicates("claim")
         wide = wide[[name for name in READINGS if name in wide]].fillna("").reset_index()
-        same = shared(own).rename("as the default")
+        same = shared(of_world).rename("as the default")
         frame = order.merge(wide).merge(same, "left", left_on="claim", right_index=True).fillna("")
         frame = frame.sort_values("claim", key=lambda names: names.str[1:].astype(int))
         note = (
@@ -298,8 +304,8 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
 def shared(answers: pd.DataFrame) -> pd.Series:
     """By whole claim of one world, how many readings share the default's answer, of how many."""
     found = {}
-    for claim, own in answers[answers["whole"]].groupby("claim", sort=False):
-        said = own.set_index("reading")["verdict"]
+    for claim, of_claim in answers[answers["whole"]].groupby("claim", sort=False):
+        said = of_claim.set_index("reading")["verdict"]
         if DEFAULT in said:
             found[claim] = f"{(said == said[DEFAULT]).sum()} of {len(said)}"
     return pd.Series(found, dtype=object)

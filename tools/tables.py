@@ -81,7 +81,7 @@ def _make(name: str) -> tuple[int, list[str]]:
     made = folder, plan.with_episodes, plan.measured
     command = shlex.join(["snakemake", "all", "--configfile", *given])
     papers = plan.read and plan.has_papers
-    pictures = [one for one in plan.pictures if one != "readings" or papers]
+    pictures = [name for name in plan.pictures if name != "readings" or papers]
     results.measure(frames, plan.measured, folder, FIGURES, plan.paper if papers else None)
     results.tabulate(*made, plan.paper, study.labels)
     results.write_table2(folder, plan.ppo_settings(), plan.paper)
@@ -90,7 +90,7 @@ def _make(name: str) -> tuple[int, list[str]]:
         results.judge(*made, plan.paper, command, seconds)
     results.write_page(*made, plan.paper, plan.tabulated, pictures, command, plan.judged)
     results.draw(folder, pictures, *made[1:], plan.paper, plan.style, plan.judged, kinds=["png"])
-    wanted = [*OF_ALL, *(OF_PAPERS if papers else ()), *(f"{one}.png" for one in pictures)]
+    wanted = [*OF_ALL, *(OF_PAPERS if papers else ()), *(f"{name}.png" for name in pictures)]
     write_readme(name)
     return len(frames), [*dict.fromkeys(o for o in wanted if (folder / o).exists()), README]
 

@@ -62,10 +62,10 @@ def make(folder: Path) -> list[str]:
     places, draws = [], []
     for metrics in dict.fromkeys((tuple(table1.public_code), AS_NAMED)):
         read = table1.model_copy(update={"public_code": list(metrics)})
-        for world, own in runs.items():
+        for world, rows in runs.items():
             rule = {"world": world, "rule": " / ".join(metrics)}
-            places.append(numbers(own, read).assign(**rule))
-            draws.append(draw(own, read)._asdict() | rule)
+            places.append(numbers(rows, read).assign(**rule))
+            draws.append(draw(rows, read)._asdict() | rule)
     tables |= {"numbers": pd.concat(places), "draws": pd.DataFrame(draws)}
     pictures["numbers"] = worlds.draw_numbers(runs, table1, look)
     pictures["curves"] = worlds.draw_curves(curves, quantity("1", study.metrics), look)
@@ -100,12 +100,12 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
     """The tables in words, for README.md."""
     sections = []
     ways = tables["verdicts"].groupby("measured") if "verdicts" in tables else ()
-    for way, own in sorted(ways, key=lambda pair: pair[0] != DECIDES):
+    for way, of_way in sorted(ways, key=lambda pair: pair[0] != DECIDES):
         said = [
             f"{row.verdict}: {worlds.difference(row.difference, row.low, row.high)}"
-            for row in records(own)
+            for row in records(of_way)
         ]
-        long = own.assign(said=said)
+        long = of_way.assign(said=said)
         wide = long.pivot(index=["claim", "statement"], columns="world", values="said")
         order = long[["claim", "statement"]].drop_duplicates()
         frame = order.merge(wide[long["world"].unique()].reset_index()).fillna("")
@@ -169,8 +169,8 @@ def _read(folder: Path, world: str, name: str) -> pd.DataFrame:
 def _runs(folder: Path, world: str, variants: Iterable[str]) -> pd.DataFrame:
     """A metrics.csv; `RecordError` unless each environment has as many runs of all `variants`."""
     path, table = folder / world / "metrics.csv", _read(folder, world, "metrics.csv")
-    for environment, own in table.groupby("env"):
-        counts = own["variant"].value_counts().reindex([*variants], fill_value=0)
+    for environment, rows in table.groupby("env"):
+        counts = rows["variant"].value_counts().reindex([*variants], fill_value=0)
         if counts.nunique() > 1 or not counts.iloc[0]:
             found = ", ".join(f"{count} of {name}" for name, count in counts.items())
             raise RecordError(f"{path}: the runs of {environment} are not complete: {found}")

@@ -59,7 +59,7 @@ def read(path: Path, returns: str | None = None, lengths: str | None = None) -> 
     if not found:
         raise RecordError(f"{path}: no file in it is called {MONITORS}")
     first = min(start for start, _ in found)
-    rows = [row._replace(ended=start - first + row.ended) for start, own in found for row in own]
+    rows = [row._replace(ended=start - first + row.ended) for start, part in found for row in part]
     return sorted(rows, key=lambda row: row.ended)
 
 
@@ -139,7 +139,7 @@ def write(runs: Mapping[Path, Sequence[Row]], environment: str, variant: str, ou
         record.unlink()
     for seed, (origin, rows) in enumerate(runs.items()):
         steps = itertools.accumulate(row.length for row in rows)
-        own = [
+        records = [
             EpisodeRecord(
                 episode=number,
                 env_steps=step,
@@ -153,11 +153,11 @@ def write(runs: Mapping[Path, Sequence[Row]], environment: str, variant: str, ou
         ]
         folder = place / f"seed{seed}"
         folder.mkdir(parents=True, exist_ok=True)
-        write_episodes(folder / files.EPISODES, as_columns(EpisodeRecord, own))
+        write_episodes(folder / files.EPISODES, as_columns(EpisodeRecord, records))
         sources = sorted(origin.glob(MONITORS)) if origin.is_dir() else [origin]
         run = {"environment": environment, "variant": variant, "seed": seed}
         content = {
-            "config": run | {"episodes": len(own), "imported": True},
+            "config": run | {"episodes": len(records), "imported": True},
             "imported": {str(path): provenance.file_digest(path) for path in sources},
             "versions": {},  # nothing is known of these, ...
             "sources": "",  # ... of the code ...
@@ -199,7 +199,7 @@ def write_study(
     if not variants or not all(seeds.values()):
         what = "variant" if not variants else "seed"
         raise ConfigError(f"{results}: no {what} is in each of {', '.join(environments)}")
-    own = {
+    changes = {
         "results": str(results),
         "environments": environments,
         "variants": variants,
@@ -215,7 +215,7 @@ def write_study(
         },
     }
     known = read_yaml(path) if path.exists() else {}
-    text = yaml.safe_dump(merge(known, own), None, **WRITTEN)
+    text = yaml.safe_dump(merge(known, changes), None, **WRITTEN)
     write_atomically(path, f"# Runs of others: mace-import wrote this, and renews it.\n{text}")
     shown = {(env, name, seed) for env in environments for name in variants for seed in seeds[env]}
     return [" ".join(map(str, run)) for run in sorted(runs - shown)]
@@ -245,14 +245,16 @@ def main() -> None:
     add("--length", dest="lengths", metavar="COLUMN", help=f"its steps {first(', '.join(LENGTH))}")
     add("--random-return", type=float, help="of random actions, the mean, if config.yaml has none")
     add("--out", required=True, type=Path, help="the study's folder of results")
-    own = parser.parse_args()
+    given = parser.parse_args()
     try:
-        check_name(own.env, "--env")
-        check_name(own.variant, "--variant")
-        runs = {path: read(path, own.returns, own.lengths) for path in own.runs}
-        write(runs, own.env, own.variant, own.out)
-        random = {} if own.random_return is None else {own.env: own.random_return}
-        lacking = write_study(own.out, {own.variant: own.label} if own.label else {}, random)
+        check_name(given.env, "--env")
+        check_name(given.variant, "--variant")
+        runs = {path: read(path, given.returns, given.lengths) for path in given.runs}
+        write(runs, given.env, given.variant, given.out)
+        random = {} if given.random_return is None else {given.env: given.random_return}
+        lacking = write_study(
+            given.out, {given.variant: given.label} if given.label else {}, random
+        )
     except (Refusal, OSError) as error:
         sys.exit(f"mace-import: {' '.join(str(error).split())}")
     for seed, (path, rows) in enumerate(runs.items()):
@@ -263,7 +265,7 @@ def main() -> None:
         print(f"{path}: seed {seed}, {len(rows)} episodes, {steps}, {has}")
     if lacking:
         print("not in the study, since another variant lacks it:", ", ".join(lacking))
-    print(f"next: snakemake -j2 all --configfile {own.out / STUDY}")
+    print(f"next: snakemake -j2 all --configfile {given.out / STUDY}")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mace_rl.base import files
+from mace_rl.environments import spec_of
 from mace_rl.runs.provenance import read_record
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, read_claims, too_few
 from mace_study.config.metrics import MetricsConfig
@@ -68,6 +69,35 @@ class Plan:
         return {pair: self.study.settings_of(*pair) for pair in pairs}
 
     @cached_property
+    def work(self) -> dict[tuple[str, str], int]:
+        """How long runs can take, by environment and variant: in steps of plain PPO, at most."""
+        found = {}
+        for environment, variant in self.run_settings:
+            if variant in self.trained:
+                config, spec = self.study.run_config(environment, variant, 0), spec_of(environment)
+                limit = config.max_episode_steps or (spec and spec.max_episode_steps) or 1000
+                steps = config.episodes * limit
+                found[environment, variant] = steps * (1 if config.beta.kind == "none" else 2)
+        return found
+
+    @cached_property
+    def first_runs(self) -> list[tuple[str, str, int]]:
+        """One of each environment, of those that can take longest."""
+        longest = {}
+        for pair in sorted(self.work, key=self.work.__getitem__):
+            longest[pair[0]] = pair
+        seeds = {run[:2]: run for run in reversed(self.runs)}
+        return [seeds[pair] for pair in longest.values()]
+
+    def priority(self, environment: str, variant: str, seed: int) -> int:
+        """Of a run: longer ones start earlier, and no core idles at the end.
+
+        Before all others come `first_runs`: code for several environments is compiled side by side.
+        """
+        first = (environment, variant, seed) in self.first_runs
+        return self.work[environment, variant] + first * max(self.work.values())
+
+    @cached_property
     def with_episodes(self) -> list[tuple[str, str, int, int]]:
         """`runs`, each with how many episodes it has; imported ones have what they have.
 
@@ -90,7 +120,9 @@ class Plan:
     @property
     def read(self) -> bool:
         """Whether Table 1 can be read in several ways, as what counts episodes can."""
-        counted = {one.name for one in all_metrics(self.measured) if one.unit == "episodes"}
+        counted = {
+            metric.name for metric in all_metrics(self.measured) if metric.unit == "episodes"
+        }
         return bool(counted.intersection(self.paper.table1.metrics))
 
     @cached_property

@@ -78,8 +78,8 @@ def tabulate(
 
 def write_table2(folder: Path, ppo: Mapping[str, Any], paper: ClaimsConfig) -> None:
     """The hyperparameters; ppo: by environment."""
-    own = {env: PPOConfig.model_validate(settings) for env, settings in ppo.items()}
-    write_atomically(folder / "table2.tex", table2_latex(own, paper.table2))
+    configs = {env: PPOConfig.model_validate(settings) for env, settings in ppo.items()}
+    write_atomically(folder / "table2.tex", table2_latex(configs, paper.table2))
 
 
 def judge(
@@ -154,7 +154,7 @@ def draw(
             figure = picture.draw(table, look)
         else:
             shown = curves.quantity(name.removeprefix("figure"), settings)
-            own = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
-            means, seeds = map(read_made, own)
+            paths = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
+            means, seeds = map(read_made, paths)
             figure = curves.draw_figure(means, seeds, shown, look)
         curves.save_figure(figure, *(folder / f"{name}.{kind}" for kind in kinds))

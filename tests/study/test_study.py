@@ -21,9 +21,11 @@ from mace_rl.config.run import RunConfig
 from mace_rl.config.section import ConfigError, check
 from mace_study.compare.claims_config import read_claims
 from mace_study.config.study import LABEL, load_study, read_study
+from mace_study.plan import Plan
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 RULES = CONFIG.parent / "workflow" / "rules"
+ROOT = CONFIG.parent
 PLAIN = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
 
 
@@ -326,3 +328,17 @@ def test_planning_and_tabulating_import_nothing_slow(code, forbidden, backend) -
     done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert "mace_study.config.metrics" in loaded and not loaded & forbidden
+
+
+def test_one_run_of_each_environment_starts_first_then_the_longest():
+    given = {"environments": ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"], "seeds": "3-4"}
+    given["environment_settings"] = {"Acrobot-v1": {"episodes": 900}}
+    plan = Plan(load_study(changed(given), "test"), ROOT)
+    asked = {"ppo": 1, "mace_fixed": 2, "mace_full": 2}  # what a bonus costs
+    steps = {"CartPole-v1": 2000 * 500, "Acrobot-v1": 900 * 500, "HopperBulletEnv-v0": 6000 * 1000}
+    for env, variant, _ in plan.runs:
+        assert plan.work[env, variant] == steps[env] * asked[variant]
+    order = sorted(plan.runs, key=lambda run: -plan.priority(*run))
+    assert {env for env, *_ in order[:3]} == {*steps} and "ppo" not in {run[1] for run in order[:3]}
+    works = [plan.work[run[:2]] for run in order[3:]]
+    assert works == sorted(works, reverse=True) and len(works) == 15

@@ -67,22 +67,19 @@ wildcard_constraints:
     seed=one_of(dict.fromkeys(seed for _, _, seed in plan.runs)),
 
 
+def run_of(wildcards):
+    """Environment, variant and seed."""
+    return FOLDERS[wildcards.env], wildcards.variant, int(wildcards.seed)
+
+
 def run_config(wildcards):
     """All that determines a run besides the code."""
-    return study.run_config(FOLDERS[wildcards.env], wildcards.variant, int(wildcards.seed))
-
-
-def most_work(wildcards):
-    """A measure of how long a run can take: long ones start first, and no core idles at the end."""
-    config = run_config(wildcards)
-    own_limit = registered()[config.environment.rpartition(":")[2]].max_episode_steps
-    steps = config.episodes * (config.max_episode_steps or own_limit or 1000)
-    return steps if config.beta.kind == "none" else 2 * steps
+    return study.run_config(*run_of(wildcards))
 
 
 def minutes(wildcards):
     """The time to ask a cluster for."""
-    return slurm.minutes(run_config(wildcards), most_work(wildcards))
+    return slurm.minutes(run_config(wildcards), plan.work[run_of(wildcards)[:2]])
 
 
 def queue_entry(wildcards):

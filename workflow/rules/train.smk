@@ -11,7 +11,7 @@ rule train:
         f"{RESULTS}/logs/train/{{env}}/{{variant}}/seed{{seed}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/train/{{env}}/{{variant}}/seed{{seed}}.tsv"
-    priority: most_work
+    priority: lambda wildcards: plan.priority(*run_of(wildcards))
     group:
         queue_entry
     threads: 1

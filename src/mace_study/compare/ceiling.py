@@ -30,11 +30,11 @@ def gains(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """
     how = settings.confidence, settings.bootstrap_repetitions
     found = []
-    for key, own in rows.groupby(KEY, sort=False):
-        wide = own.drop_duplicates(["seed", "who"]).pivot(
+    for key, forks in rows.groupby(KEY, sort=False):
+        wide = forks.drop_duplicates(["seed", "who"]).pivot(
             index="seed", columns="who", values="mean_return"
         )
-        for other in (name for name in own["who"].unique() if name != ORACLE):
+        for other in (name for name in forks["who"].unique() if name != ORACLE):
             difference = (wide[ORACLE] - wide[other]).to_numpy()
             generator = np.random.default_rng(settings.bootstrap_seed)
             compared = map(float, paired_comparison(difference, *how, generator))
@@ -53,15 +53,17 @@ def effects(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     how = settings.confidence, settings.bootstrap_repetitions
     found = []
     groups = rows[rows["who"] == ORACLE].groupby([*KEY, "stretch"], sort=False)
-    for (world, env, horizon, _), own in groups:
+    for (world, env, horizon, _), forks in groups:
         generator = np.random.default_rng(settings.bootstrap_seed)
         effect, low, high, _ = map(
-            float, paired_comparison(own["effect"].to_numpy(), *how, generator)
+            float, paired_comparison(forks["effect"].to_numpy(), *how, generator)
         )
-        noise = math.sqrt((own["noise"] ** 2).mean())
+        noise = math.sqrt((forks["noise"] ** 2).mean())
         count = stretches(effect, noise)
-        key, length = (world, env, horizon), int(own["stretch"].iloc[0])
-        found.append((*key, length, len(own), effect, low, high, noise, count, 2 * count * length))
+        key, length = (world, env, horizon), int(forks["stretch"].iloc[0])
+        found.append(
+            (*key, length, len(forks), effect, low, high, noise, count, 2 * count * length)
+        )
     names = ["stretch", "seeds", "effect", "low", "high", "noise", "stretches", "needed"]
     return pd.DataFrame(found, columns=[*KEY, *names])
 

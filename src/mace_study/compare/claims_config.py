@@ -198,7 +198,7 @@ def _with_learned(part: Any, learned: str) -> Any:
     if isinstance(part, dict):
         return {_with_learned(key, learned): _with_learned(x, learned) for key, x in part.items()}
     if isinstance(part, list):
-        return [_with_learned(one, learned) for one in part]
+        return [_with_learned(each, learned) for each in part]
     return learned if part == LEARNED else part
 
 
@@ -290,6 +290,6 @@ def _check_form(claims: ClaimsConfig) -> None:
                     " first of its family"
                 )
             for way, parts in claim.parts.items():
-                each = [part[:-1] for one in parts for part in one.each(table1)]
+                each = [part[:-1] for several in parts for part in several.each(table1)]
                 if len(set(each)) < len(each):
                     raise ConfigError(f"{key}.parts.{way} has a part twice")

@@ -29,9 +29,9 @@ def kinds(settings: MetricsConfig, table1: Table1Config) -> list[tuple[str, Metr
     """Every reading, in episodes, with the one of the paper's metrics that it reads."""
     both = itertools.product(table1.metrics, all_metrics(settings))
     return [
-        (kind, one)
-        for kind, one in both
-        if one.unit == "episodes" and table1.metric_of(one.name) == kind
+        (kind, metric)
+        for kind, metric in both
+        if metric.unit == "episodes" and table1.metric_of(metric.name) == kind
     ]
 
 
@@ -65,7 +65,7 @@ def readings(
     rules = [metric for _, metric in asked if metric.name in table1.public_code]
     mixed = metrics_table(shuffled(frames, settings), settings, rules)
     runs = {RUNS: table, SHUFFLED: mixed}
-    means = {source: summary(own, settings, table1) for source, own in runs.items()}
+    means = {source: summary(rows, settings, table1) for source, rows in runs.items()}
     parts = []
     for environment in dict.fromkeys(name for name, _, _ in frames):
         for kind in dict.fromkeys(kind for kind, _ in asked):
@@ -73,8 +73,8 @@ def readings(
         for (kind, metric), source in itertools.product(asked, (RUNS, SHUFFLED)):
             if source == RUNS or metric in rules:
                 both = means[source], runs[source]
-                rows, own = (frame[frame["env"] == environment] for frame in both)
-                rows = _measured(rows[rows["metric"] == metric.name], own, metric, settings)
+                rows, of_runs = (frame[frame["env"] == environment] for frame in both)
+                rows = _measured(rows[rows["metric"] == metric.name], of_runs, metric, settings)
                 parts.append(rows.assign(kind=kind, source=source))
     found = pd.concat(parts).rename(columns={"metric": "reading"})
     return found[COLUMNS].reset_index(drop=True)
@@ -123,7 +123,7 @@ def in_order(table: pd.DataFrame) -> list[tuple[tuple[str, str, str], pd.DataFra
     """The rows of each line of the table: by metric; the paper's first, shuffled runs last."""
     order = [*table["kind"].unique()], [PAPER, RUNS, SHUFFLED]
     lines: Any = table.groupby(["kind", "reading", "source"], sort=False)
-    return sorted(lines, key=lambda one: (order[0].index(one[0][0]), order[1].index(one[0][2])))
+    return sorted(lines, key=lambda line: (order[0].index(line[0][0]), order[1].index(line[0][2])))
 
 
 def ranked(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], bool]:

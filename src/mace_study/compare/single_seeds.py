@@ -39,13 +39,13 @@ def numbers(runs: pd.DataFrame, table1: Table1Config) -> pd.DataFrame:
     """
     names = ["env", "variant", "metric", "paper", "seeds", "low", "median", "high", "place"]
     rows = []
-    for (env, variant), own in _cells(runs, table1).items():
+    for (env, variant), seeds in _cells(runs, table1).items():
         paper = np.array(table1.values[env][variant], np.float64)
         ends = (1 - CENTRAL) / 2, 0.5, (1 + CENTRAL) / 2
-        found = *np.quantile(own, ends, axis=0), places(paper, own)
+        found = *np.quantile(seeds, ends, axis=0), places(paper, seeds)
         for column, metric in enumerate(table1.public_code):
-            one = (values[column] for values in found)
-            rows.append((env, variant, metric, paper[column], len(own), *one))
+            of_column = (values[column] for values in found)
+            rows.append((env, variant, metric, paper[column], len(seeds), *of_column))
     table = pd.DataFrame(rows, columns=names)
     return table.assign(unusual=_unusual(table["place"].to_numpy()).astype(int))
 
@@ -55,9 +55,9 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
     cells = _cells(runs, table1)
     environments = list(dict.fromkeys(env for env, _ in cells))
     found = int(numbers(runs, table1)["unusual"].sum())
-    unusual = at_least(_unusual_when_drawn(own) for own in cells.values())
+    unusual = at_least(_unusual_when_drawn(seeds) for seeds in cells.values())
     paper = {env: first_in(_paper(env, table1)) for env in table1.values}
-    led = {name: sum(one[name].item() for one in paper.values()) for name in table1.variants}
+    led = {name: sum(leads[name].item() for leads in paper.values()) for name in table1.variants}
     favoured = max(led, key=led.__getitem__)
     first = sum(int(paper[env][favoured].item()) for env in environments)
     firsts = []
@@ -66,7 +66,7 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
         firsts.append(
             {name: _shares(counts, len(table1.public_code)) for name, counts in wins.items()}
         )
-    own = at_least(shares[favoured] for shares in firsts)
+    favoured_first = at_least(shares[favoured] for shares in firsts)
     anyone = at_least(np.mean(list(shares.values()), axis=0) for shares in firsts)
     return Draw(
         unusual=found,
@@ -75,7 +75,7 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
         limit=int(np.argmax(np.append(unusual, 0.0) < LEVEL)),
         favoured=favoured,
         first=first,
-        chance_first=float(own[first]),
+        chance_first=float(favoured_first[first]),
         chance_any=float(anyone[first]),
     )
 
@@ -130,11 +130,11 @@ def _unusual(place: np.ndarray) -> np.ndarray:
     return np.abs(place - 0.5) >= CENTRAL / 2 - 1e-9
 
 
-def _unusual_when_drawn(own: np.ndarray) -> np.ndarray:
+def _unusual_when_drawn(seeds: np.ndarray) -> np.ndarray:
     """How often 0, 1, ... columns of a seed are unusual among the others, [columns + 1]."""
-    others = (np.delete(own, seed, axis=0) for seed in range(len(own)))
-    place = np.array([places(row, rest) for row, rest in zip(own, others, strict=True)])
-    return _shares(_unusual(place).sum(axis=1), own.shape[1])
+    others = (np.delete(seeds, seed, axis=0) for seed in range(len(seeds)))
+    place = np.array([places(row, rest) for row, rest in zip(seeds, others, strict=True)])
+    return _shares(_unusual(place).sum(axis=1), seeds.shape[1])
 
 
 def _shares(counts: np.ndarray, most: int) -> np.ndarray:

@@ -72,8 +72,8 @@ def paired_comparison(
     """
     mean = np.mean(differences, axis=0)
     low, high = mean_interval(differences, confidence, repetitions, generator)
-    one = len(differences) == 1
-    p = np.full_like(mean, np.nan) if one else _sign_flips(differences, repetitions, generator)
+    single = len(differences) == 1
+    p = np.full_like(mean, np.nan) if single else _sign_flips(differences, repetitions, generator)
     return PairedComparison(mean, low, high, p)
 
 
@@ -116,11 +116,14 @@ def _sign_flips(
     drawn, p_values = signs(repetitions, seeds, generator), np.empty(values.shape[1:])
     how |= {"n_resamples": repetitions, "batch": BATCH}
     for metric in np.ndindex(p_values.shape):  # `permutation_test` would take 25 times as long
-        own, batches = shares[:, *metric], iter(np.split(drawn, range(BATCH, repetitions, BATCH)))
+        column, batches = (
+            shares[:, *metric],
+            iter(np.split(drawn, range(BATCH, repetitions, BATCH))),
+        )
         tested = scipy.stats.monte_carlo_test(
             np.ones(seeds),
             lambda size, batches=batches: next(batches),
-            lambda flips, axis, own=own: np.round(flips @ own, 12),
+            lambda flips, axis, column=column: np.round(flips @ column, 12),
             **how,
         )
         p_values[metric] = tested.pvalue

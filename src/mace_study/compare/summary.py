@@ -26,7 +26,7 @@ def summary(table: pd.DataFrame, settings: MetricsConfig, table1: Table1Config) 
     """
     rows = []
     for (environment, variant), runs in table.groupby(["env", "variant"], sort=False):
-        for metric in (one for one in all_metrics(settings) if one.name in runs):
+        for metric in (known for known in all_metrics(settings) if known.name in runs):
             values = runs[metric.name].to_numpy(np.float64)  # [seeds]
             low, high = interval(values, settings)
             limits = {"episodes": (1, runs["episodes"].mean()), "share": (0, 1)}

@@ -255,7 +255,9 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
 
     Raises `ConfigError` for what is no metric.
     """
-    metrics = [one for one in METRICS if one.needs is None or getattr(settings, one.needs)]
+    metrics = [
+        metric for metric in METRICS if metric.needs is None or getattr(settings, metric.needs)
+    ]
     for reference in settings.custom:
         metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
         if not isinstance(metric, Metric):
@@ -282,7 +284,7 @@ def out_of_reach(settings: MetricsConfig, episodes: int) -> list[str]:
     """The metrics that no training of so many episodes attains, for it has too few to average."""
     counted = (metric for metric in all_metrics(settings) if metric.unit == "episodes")
     window = settings.moving_average
-    return [one.name for one in counted if one.earliest(window, episodes) > episodes]
+    return [metric.name for metric in counted if metric.earliest(window, episodes) > episodes]
 
 
 def metric_units(settings: MetricsConfig) -> dict[str, str]:

@@ -90,7 +90,7 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
     """
     columns = ["env", "variant", "seed", "episode", shown.name]
     every = shown.zero_is_shown
-    variants = {run[1] for run, own in frames.items() if every or own[shown.column].any()}
+    variants = {run[1] for run, frame in frames.items() if every or frame[shown.column].any()}
     keys, episodes, averages = [], [], []
     shortest: dict[tuple[str, str], int] = {}
     for (environment, variant, _), frame in frames.items():
@@ -152,28 +152,28 @@ def draw_figure(
             return figure
         uneven = curves["n"].nunique() > 1
         for environment, axes in zip(environments, panels, strict=True):
-            own, runs = (frame[frame["env"] == environment] for frame in (curves, single_seeds))
+            means, runs = (frame[frame["env"] == environment] for frame in (curves, single_seeds))
             values = runs[shown.name]
-            if own["n"].max() > SINGLE_SEEDS:
-                values = own[["mean", "lower", "upper"]].stack()
+            if means["n"].max() > SINGLE_SEEDS:
+                values = means[["mean", "lower", "upper"]].stack()
             margin = 0.05 * (values.max() - values.min() or 1)
             spanned = values.min() - margin, values.max() + margin
             axes.set_ylim(reaching(shown.limits, values) if shown.limits else spanned)
-            axes.set_xlim(0, own["episode"].max())
+            axes.set_xlim(0, means["episode"].max())
             axes.locator_params(nbins=4)
-            axes.set_title(environment + (f" ({own['n'].max()} seeds)" if uneven else ""))
-            draw_means(axes, own, look)
-            seeds = own.groupby("variant")["n"].max()
+            axes.set_title(environment + (f" ({means['n'].max()} seeds)" if uneven else ""))
+            draw_means(axes, means, look)
+            seeds = means.groupby("variant")["n"].max()
             for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
                 faint: dict[str, Any] = {"color": look.colours[variant], "linewidth": 0.5}
                 faint |= {"alpha": 0.6 / math.sqrt(seeds[variant]), "zorder": 1}
                 if 1 < seeds[variant] <= SINGLE_SEEDS:  # the line of one is the mean's
                     axes.plot(run["episode"], run[shown.name], **faint)
             share = look.layout.inset
-            if share and shown.limits is None and _is_early(own, share) and _is_free(axes, own):
+            if share and shown.limits is None and _is_early(means, share) and _is_free(axes, means):
                 inset = axes.inset_axes(INSET)
-                draw_means(inset, own[own["episode"] <= share * own["episode"].max()], look)
-                inset.set_xlim(0, share * own["episode"].max())
+                draw_means(inset, means[means["episode"] <= share * means["episode"].max()], look)
+                inset.set_xlim(0, share * means["episode"].max())
                 inset.locator_params(nbins=3)
                 inset.tick_params(labelsize="x-small")
         most, explained = curves["n"].max(), "One seed."

@@ -107,15 +107,15 @@ def latex_cell(cell: str | Cell) -> str:
     if isinstance(cell, str):
         return escaped(cell)
     texts = []
-    for one in cell.values:
-        text = rf"\textbf{{{escaped(one.text)}}}" if one.best else escaped(one.text)
-        dagger = one.mark.replace("†", r"\dagger")
+    for value in cell.values:
+        text = rf"\textbf{{{escaped(value.text)}}}" if value.best else escaped(value.text)
+        dagger = value.mark.replace("†", r"\dagger")
         texts.append(text + (f"$^{{{dagger}}}$" if dagger else ""))
-    if not any(one.low for one in cell.values):
+    if not any(value.low for value in cell.values):
         return stack(*texts, align="l")
     ends = (
-        "--" if one.low == DASH else rf"[{escaped(one.low)},\,{escaped(one.high)}]"
-        for one in cell.values
+        "--" if value.low == DASH else rf"[{escaped(value.low)},\,{escaped(value.high)}]"
+        for value in cell.values
     )
     return stack(cell.joint.join(texts), rf"{{\scriptsize {'/'.join(ends)}}}")
 

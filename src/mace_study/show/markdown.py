@@ -28,8 +28,11 @@ def markdown(frame: pd.DataFrame) -> str:
 def _markdown(cell: str | Cell) -> str:
     if isinstance(cell, str):
         return cell.replace("|", "\\|")
-    texts = (f"**{one.text}{one.mark}**" if one.best else one.text + one.mark for one in cell[0])
-    intervals = [f"{one.low} to {one.high}" for one in cell.values if one.low]
+    texts = (
+        f"**{value.text}{value.mark}**" if value.best else value.text + value.mark
+        for value in cell[0]
+    )
+    intervals = [f"{value.low} to {value.high}" for value in cell.values if value.low]
     interval = f" ({cell.joint.join(intervals)})" if intervals else ""
     return cell.joint.join(texts) + interval + (f"; {cell.note}" if cell.note else "")
 
@@ -49,4 +52,6 @@ def plain(frame: pd.DataFrame) -> str:
 def _plain(cell: str | Cell) -> str:
     if isinstance(cell, str):
         return cell
-    return cell.joint.join(f"{one.text}{one.mark}{'*' if one.best else ''}" for one in cell.values)
+    return cell.joint.join(
+        f"{value.text}{value.mark}{'*' if value.best else ''}" for value in cell.values
+    )

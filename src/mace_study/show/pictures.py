@@ -83,7 +83,7 @@ def constants(source: Source) -> pd.DataFrame:
     roles = dict.fromkeys(settings.constants.fixed, FIXED_BETA)
     roles |= dict.fromkeys(runs["variant"].unique(), OTHER) | roles
     roles[settings.constants.learned] = LEARNED
-    areas = {key: own["area_under_curve"] for key, own in runs.groupby(["env", "variant"])}
+    areas = {key: of_key["area_under_curve"] for key, of_key in runs.groupby(["env", "variant"])}
     rows = []
     pairs = itertools.product(runs["env"].unique(), roles)
     for environment, variant in (pair for pair in pairs if pair in areas):
@@ -98,9 +98,9 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
     with style():
         names = "Constant β", "Mean return of training"
         figure, panels = grid(table["env"].nunique(), look.layout.columns, *names)
-        for (environment, own), axes in zip(table.groupby("env", sort=False), panels, strict=True):
-            fixed = own[own["role"] == FIXED_BETA]
-            for place, (_, row) in enumerate(own[own["role"] != LEARNED].iterrows()):
+        for (environment, rows), axes in zip(table.groupby("env", sort=False), panels, strict=True):
+            fixed = rows[rows["role"] == FIXED_BETA]
+            for place, (_, row) in enumerate(rows[rows["role"] != LEARNED].iterrows()):
                 constant, name = row["role"] == FIXED_BETA, row["variant"]
                 dot: dict[str, Any] = {"color": "dimgray"}
                 if not constant:
@@ -110,7 +110,7 @@ def draw_constants(table: pd.DataFrame, look: PlotStyle) -> Figure:
                 at = place + 0.5 * (not constant), row["mean"]
                 axes.errorbar(*at, ends, fmt="o", markersize=3, **dot)
             axes.plot(range(len(fixed)), fixed["mean"], color="dimgray", linewidth=0.8)
-            for _, row in own[own["role"] == LEARNED].iterrows():
+            for _, row in rows[rows["role"] == LEARNED].iterrows():
                 colour, label = look.colours[row["variant"]], look.labels[row["variant"]]
                 axes.axhspan(row["low"], row["high"], color=colour, alpha=0.2, linewidth=0)
                 axes.axhline(row["mean"], color=colour, linewidth=1.3, label=label, zorder=1)
@@ -163,7 +163,8 @@ def forest(source: Source) -> pd.DataFrame:
     and size (of the part). More is in the claim's favour.
     """
     rows = []
-    for answer, (how, judged) in ((one, way) for one in source.answers for way in one.ways.items()):
+    judgements = ((answer, way) for answer in source.answers for way in answer.ways.items())
+    for answer, (how, judged) in judgements:
         common = (how, answer.claim, answer.statement, judged.verdict, judged.outcome)
         for part in judged.parts:
             values = part.difference, part.low, part.high, part.in_paper
@@ -215,23 +216,23 @@ def draw_forest(table: pd.DataFrame, look: PlotStyle) -> Figure:
         height = 0.2 * count + LEGEND_HEIGHT
         figure, (names, *panels) = grid(1 + len(ways), 1 + len(ways), height=height)
         for how, axes in zip(ways, panels, strict=True):
-            own = table[table["measured"] == how]
+            measured = table[table["measured"] == how]
             for outcome, (colour, label) in OUTCOMES.items():
-                parts = own[own["outcome"] == outcome]
+                parts = measured[measured["outcome"] == outcome]
                 if parts.empty:
                     continue
                 bars = parts["place"], parts["low"], parts["high"]
                 axes.hlines(*bars, color=colour, linewidth=1.2)
                 dots: dict[str, Any] = {"color": colour, "markersize": 3.5, "label": label}
                 axes.plot(parts["difference"], parts["place"], "o", **dots)
-            if own["paper"].notna().any():
-                axes.plot(own["paper"], own["place"], "d", **hollow)
+            if measured["paper"].notna().any():
+                axes.plot(measured["paper"], measured["place"], "d", **hollow)
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
             for margin in (-1, 1):
                 axes.axvline(margin, color=INK, linewidth=0.8, linestyle="--", zorder=1)
             axes.set(title=str(how).capitalize(), xlim=(-reach, reach), yticks=[])
             axes.set_xlabel("Difference in favour of what is said\n(1: the margin)")
-            for name, claim in own.groupby("claim", sort=False):
+            for name, claim in measured.groupby("claim", sort=False):
                 (verdict, answer), *_ = claim[["verdict", "answer"]].to_numpy()
                 top, colour = blocks[str(name)][0] + 0.2, OUTCOMES[answer][0]
                 axes.text(reach, top, verdict, color=colour, ha="right", va="top", **small)
@@ -284,9 +285,9 @@ def draw_readings(table: pd.DataFrame, look: PlotStyle) -> Figure:
         figure, panels = grid(count, count, "Training episodes", height=height)
         for environment, axes in zip(environments, panels, strict=True):
             for place, ((_, _, source), rows) in enumerate(lines):
-                own = rows[rows["env"] == environment].set_index("variant")
-                for name in own.index:
-                    row = own.loc[name]
+                by_variant = rows[rows["env"] == environment].set_index("variant")
+                for name in by_variant.index:
+                    row = by_variant.loc[name]
                     shift = step * (variants.index(name) - (len(variants) - 1) / 2)
                     colour = look.colours[name]
                     axes.hlines(place + shift, row["low"], row["high"], color=colour, linewidth=1)

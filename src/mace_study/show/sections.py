@@ -56,7 +56,7 @@ def read_data(
 def by_family(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
     """The answers of each family that has been asked."""
     titles = dict.fromkeys(answer.family for answer in answers)
-    return {title: [one for one in answers if one.family == title] for title in titles}
+    return {title: [answer for answer in answers if answer.family == title] for title in titles}
 
 
 def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
@@ -68,25 +68,25 @@ def counted(answers: Sequence[Answer], how: str, claims: ClaimsConfig) -> str:
 
 def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Section]:
     """Family by family the verdicts, and then the parts in each way to measure them."""
-    for title, own in by_family(answers).items():
-        verdicts = "; ".join(f"{how}: {counted(own, how, claims)}" for how in own[0].ways)
-        note = f"Of {len(own)}, {verdicts}. The rule: docs/metrics.md."
-        ways = [way for answer in own for way in answer.ways.values()]
+    for title, family in by_family(answers).items():
+        verdicts = "; ".join(f"{how}: {counted(family, how, claims)}" for how in family[0].ways)
+        note = f"Of {len(family)}, {verdicts}. The rule: docs/metrics.md."
+        ways = [way for answer in family for way in answer.ways.values()]
         seeds = min(part.seeds for way in ways for part in way.parts)
         if seeds < FEWEST_SEEDS:
             note += f" No claim can have a verdict: {too_few(seeds)}."
-        yield Section(title[:1].upper() + title[1:], note, tables.verdicts(own))
-        for how in own[0].ways:
-            frame = tables.parts_in_short(own, how)
+        yield Section(title[:1].upper() + title[1:], note, tables.verdicts(family))
+        for how in family[0].ways:
+            frame = tables.parts_in_short(family, how)
             yield Section(f"Part by part: {how}", PARTS, frame, level=3)
 
 
 def of_runs(data: Data, claims: ClaimsConfig, settings: MetricsConfig) -> list[Section]:
     """Everything but the ledger."""
     asked = [
-        (key.partition(".")[0], one.metric)
-        for own in claims.families.values()
-        for key, one in parts_of(own)
+        (key.partition(".")[0], part.metric)
+        for family in claims.families.values()
+        for key, part in parts_of(family)
     ]
     found = [*_means(data, claims, settings), *_compared(data, settings)]
     found += _others(data, settings, asked)
@@ -130,8 +130,8 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
             " by itself and corrected for all metrics, pairs and environments (comparisons.csv);"
             " verdicts have a correction of their own."
         )
-        own = table[(table["metric"] == metric) & (table["env"] != ALL)]
-        frame = tables.comparisons(own, means, settings)
+        compared = table[(table["metric"] == metric) & (table["env"] != ALL)]
+        frame = tables.comparisons(compared, means, settings)
         yield Section(f"{title}: differences", note, frame)
 
 

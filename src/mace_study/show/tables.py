@@ -58,7 +58,7 @@ def number(value: float | None, digits: int = 0) -> str:
 
 def estimate(value: Iterable[Any], digits: int, mark: str = "", best: bool = False) -> Value:
     """A number, low and high of its interval, as printed; dashes where there is none."""
-    text, low, high = (number(one, digits) for one in value)
+    text, low, high = (number(bound, digits) for bound in value)
     return Value(text, low, high, mark, best)
 
 
@@ -115,25 +115,29 @@ def companions(table: pd.DataFrame, settings: MetricsConfig) -> dict[str, pd.Dat
         return Cell([_mean(row, digits[row["env"], row["metric"]]) for row in rows])
 
     groups = labelled.groupby("env", sort=False)
-    return {str(env): _grid(own, cell, rows="label", columns="variant") for env, own in groups}
+    return {str(env): _grid(rows, cell, rows="label", columns="variant") for env, rows in groups}
 
 
 def means(table: pd.DataFrame, metric: str, settings: MetricsConfig) -> pd.DataFrame:
     """One metric of a `summary`, a row for each variant and a column for each environment."""
-    digits, own = digits_by_metric(table, settings), table[table["metric"] == metric]
-    return _grid(own, lambda rows: Cell([_mean(rows[0], digits[rows[0]["env"], metric])]))
+    digits, shown = digits_by_metric(table, settings), table[table["metric"] == metric]
+    return _grid(shown, lambda rows: Cell([_mean(rows[0], digits[rows[0]["env"], metric])]))
 
 
 def worst(runs: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The final return of each variant's worst seed, from the frame of metrics.csv."""
     table = runs.assign(metric="final_return", mean=runs["final_return"])
     digits = {env: count for (env, _), count in digits_by_metric(table, settings).items()}
-    return _grid(table, lambda own: number(min(run["mean"] for run in own), digits[own[0]["env"]]))
+    return _grid(
+        table, lambda rows: number(min(row["mean"] for row in rows), digits[rows[0]["env"]])
+    )
 
 
 def solved(runs: pd.DataFrame) -> pd.DataFrame:
     """How many seeds solve each task, from the frame of metrics.csv."""
-    return _grid(runs, lambda own: f"{sum(run['solved'] >= SOLVED for run in own)} of {len(own)}")
+    return _grid(
+        runs, lambda rows: f"{sum(row['solved'] >= SOLVED for row in rows)} of {len(rows)}"
+    )
 
 
 def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
@@ -141,26 +145,26 @@ def comparisons(table: pd.DataFrame, means: pd.DataFrame, settings: MetricsConfi
     digits, rows = digits_by_metric(means, settings), []
     for row in records(table):
         shown = digits[row["env"], row["metric"]]
-        own = [row["env"], f"{row['variant']} over {row['baseline']}", number(row["seeds"])]
-        own += [_estimate(row, "difference", shown, ends="")]
-        rows.append([*own, number(row["p_value"], 4), number(row["p_holm"], 4)])
+        cells = [row["env"], f"{row['variant']} over {row['baseline']}", number(row["seeds"])]
+        cells += [_estimate(row, "difference", shown, ends="")]
+        rows.append([*cells, number(row["p_value"], 4), number(row["p_holm"], 4)])
     heads = ["environment", "", "n", "difference", "p", "p (Holm)"]
     return pd.DataFrame(rows, columns=heads)
 
 
 def improvement(table: pd.DataFrame, metric: str) -> pd.DataFrame:
     """The probabilities of comparisons.csv: a row for each pair, a column for each environment."""
-    own = table.assign(pair=table["variant"] + " over " + table["baseline"])
-    own = own[own["metric"] == metric]
-    return _grid(own, lambda rows: _estimate(rows[0], "probability", 2), rows="pair")
+    pairs = table.assign(pair=table["variant"] + " over " + table["baseline"])
+    pairs = pairs[pairs["metric"] == metric]
+    return _grid(pairs, lambda rows: _estimate(rows[0], "probability", 2), rows="pair")
 
 
 def aggregate(table: pd.DataFrame) -> pd.DataFrame:
     """aggregate.csv."""
     rows = []
     for row in records(table):
-        own = [row["variant"], row["metric"].replace("_", " "), number(row["runs"])]
-        rows.append([*own, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
+        cells = [row["variant"], row["metric"].replace("_", " "), number(row["runs"])]
+        rows.append([*cells, _estimate(row, "mean", 3), _estimate(row, "iqm", 3)])
     return pd.DataFrame(rows, columns=["", "score of", "runs", "mean", "interquartile mean"])
 
 
@@ -178,7 +182,9 @@ def readings(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
         ]
         return Cell([values[0]._replace(best=is_first), *values[1:]], joint=", ")
 
-    parts = [own.assign(title=title(*key, metric_labels(settings))) for key, own in in_order(table)]
+    parts = [
+        rows.assign(title=title(*key, metric_labels(settings))) for key, rows in in_order(table)
+    ]
     frame = _grid(pd.concat(parts), cell, "episodes", rows="title")
     return frame[["episodes", *table["env"].unique()]]
 
@@ -215,7 +221,7 @@ def verdicts(answers: Sequence[Answer]) -> pd.DataFrame:
 def parts(answers: Sequence[Answer], how: str) -> pd.DataFrame:
     """Every part of the claims, measured in one of the ways."""
     rows: list[dict[str, str | Cell]] = []
-    for answer, part in ((one, part) for one in answers for part in one.ways[how].parts):
+    for answer, part in ((asked, part) for asked in answers for part in asked.ways[how].parts):
         # Of a return as many as the margin needs, which depends on the environment's scale.
         of_return = max(1, 1 - math.floor(math.log10(part.worth_mentioning)))
         digits = {"episodes": 0, "return": of_return}.get(part.unit, 3)
@@ -256,11 +262,13 @@ def _in_short(part: Row) -> Cell:
 
 def table2(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> pd.DataFrame:
     """The PPO hyperparameters: the paper's rows and Adam, then this project's further settings."""
-    own = {name: name.replace("_", " ").title() for name in PPOConfig.model_fields} | paper.others
+    titles = {
+        name: name.replace("_", " ").title() for name in PPOConfig.model_fields
+    } | paper.others
     rows = [[label, _setting(ppo, name)] for name, label in paper.rows.items()]
     rows += [["Optimizer", "Adam"]]
     others = [name for name in PPOConfig.model_fields if name not in paper.rows]
-    rows += [[own[name], _setting(ppo, name)] for name in others]
+    rows += [[titles[name], _setting(ppo, name)] for name in others]
     return pd.DataFrame(rows, columns=["Hyperparameter", "Value"])
 
 

@@ -55,7 +55,9 @@ def _decisive(judged: Judgement) -> tuple[Any, ...]:
     """
     of_parts = judged.outcome, "reversed"
     deciding = next(
-        own for what in of_parts if (own := [one for one in judged.parts if one.outcome == what])
+        parts
+        for what in of_parts
+        if (parts := [part for part in judged.parts if part.outcome == what])
     )
     part = min(deciding, key=lambda part: (part.p_holm, -abs(part.difference)))
     verdict = judged.outcome, judged.verdict
@@ -117,8 +119,8 @@ def draw_specification(table: pd.DataFrame, readings: Sequence[str]) -> Figure:
     small: dict[str, Any] = {"fontsize": "x-small", "va": "center"}
     with style():
         figure, panels = grid(groups.ngroups, groups.ngroups, height=LINE * (2.4 * len(said) + 8))
-        for (world, own), axes in zip(groups, panels, strict=True):
-            rows: Any = own.itertuples()
+        for (world, answers), axes in zip(groups, panels, strict=True):
+            rows: Any = answers.itertuples()
             for row in rows:
                 left, top = readings.index(row.reading), list(said).index(row.claim)
                 colour, label = OUTCOMES.get(row.outcome, ("#ffffff", "not asked: β does not move"))
@@ -157,9 +159,9 @@ def draw_gains(table: pd.DataFrame) -> Figure:
         figure.set_figheight(sum(heights) + LEGEND_HEIGHT)
         rows: Any = panels[0].get_gridspec()
         rows.set_height_ratios(heights)
-        for number, (((world, env), own), axes) in enumerate(zip(groups, panels, strict=True)):
+        for number, (((world, env), earned), axes) in enumerate(zip(groups, panels, strict=True)):
             axes.axvline(0, color=INK, linewidth=0.8, zorder=1)
-            runs: Any = own.itertuples()
+            runs: Any = earned.itertuples()
             for place, row in enumerate(runs):
                 oracle = row.variant.startswith("oracle")
                 colour = COLOURS[2] if oracle else COLOURS[0]
@@ -169,7 +171,7 @@ def draw_gains(table: pd.DataFrame) -> Figure:
                 axes.plot(row.gain, place, "o", **dot)
             axes.set(title=f"{env} ({world})", ylim=(longest[number // 2] - 0.5, -0.5))
             axes.set_xlim(ends.min() - margin, ends.max() + margin)
-            axes.set_yticks(range(len(own)), list(own["variant"]), fontsize="x-small")
+            axes.set_yticks(range(len(earned)), list(earned["variant"]), fontsize="x-small")
         shares = f"In the first {LAST} episodes, as shares of what solving gives."
         legend(figure, f"{shares} Bar: {100 * CONFIDENCE:g} % interval over seeds.")
     return figure
@@ -191,11 +193,11 @@ def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: P
         for (env, (column, metric)), axes in zip(cells, panels, strict=True):
             for middle, variant in zip(middles, table1.variants, strict=True):
                 for number, (world, table) in enumerate(runs.items()):
-                    own = table[(table["env"] == env) & (table["variant"] == variant)][metric]
+                    values = table[(table["env"] == env) & (table["variant"] == variant)][metric]
                     place = middle + number - (len(runs) - 1) / 2
                     dots: dict[str, Any] = {"s": 5, "linewidth": 0, "alpha": 0.7, "label": world}
-                    places = place + jitter.uniform(-0.3, 0.3, len(own))
-                    axes.scatter(own, places, color=COLOURS[number], **dots)
+                    places = place + jitter.uniform(-0.3, 0.3, len(values))
+                    axes.scatter(values, places, color=COLOURS[number], **dots)
                 ends = middle - len(runs) / 2, middle + len(runs) / 2
                 paper = table1.values[env][variant][column]
                 axes.vlines(paper, *ends, color=INK, linewidth=1.3, label="the paper's number")
@@ -218,16 +220,16 @@ def draw_numbers(runs: Mapping[str, pd.DataFrame], table1: Table1Config, look: P
 def draw_curves(curves: Mapping[str, pd.DataFrame], shown: Quantity, look: PlotStyle) -> Figure:
     """The mean curves of Figure 1 with their intervals, a row per world; by world figure1.csv."""
     environments = list(
-        dict.fromkeys(env for own in curves.values() for env in own["env"].unique())
+        dict.fromkeys(env for means in curves.values() for env in means["env"].unique())
     )
     with style():
         count = len(environments) * len(curves)
         names = "Training episodes", shown.label
         figure, panels = grid(count, len(environments), *names, height=1.7)
         places = iter(panels)
-        for world, own in curves.items():
+        for world, of_world in curves.items():
             for env in environments:
-                axes, means = next(places), own[own["env"] == env]
+                axes, means = next(places), of_world[of_world["env"] == env]
                 if means.empty:
                     axes.set_axis_off()
                     continue
