@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+import yaml
 from gymnasium.spaces import Box, Dict, Text, Tuple, flatdim, flatten
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -22,10 +23,13 @@ from mace_rl.beta.controller import BetaController
 from mace_rl.beta.objectives import Score
 from mace_rl.beta.schedule import Constant
 from mace_rl.bonus.curiosity import Curiosity
+from mace_rl.config import wrappers
 from mace_rl.config.beta import ConstantBeta
 from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
+from mace_rl.config.reading import merge, read_yaml
 from mace_rl.config.wrappers import CuriosityConfig, defaults
 from mace_rl.environments.episode import Episode
+from mace_rl.run_settings import read_settings
 from mace_rl.runs.checkpoint import archive
 from mace_rl.training.factories import meta_adaptation
 from mace_rl.wrapping.wrappers import PARTS, CuriosityReward, VectorCuriosityReward
@@ -324,3 +328,20 @@ def test_defaults_are_the_study_s(run_config):
     sections = {name: settings[name] for name in ("memory", "novelty")}
     assert config == CuriosityConfig(beta=0.4, **sections)
     assert config.discount == settings["ppo"]["discount"]
+
+
+def test_a_learned_beta_is_that_of_mace_full_wherever_it_is_set(tmp_path, monkeypatch, request):
+    path, own = (
+        tmp_path / "config.yaml",
+        {"meta": {"hidden_units": 48}, "memory": {"neighbours": 3}},
+    )
+    layers = read_yaml(wrappers.DEFAULTS), {"variant_settings": {"mace_full": own}}
+    path.write_text(yaml.safe_dump(merge(*layers)))
+    request.addfinalizer(defaults.cache_clear)
+    defaults.cache_clear()
+    monkeypatch.setattr(wrappers, "DEFAULTS", path)
+    config = CuriosityConfig(beta="learned")
+    expected = read_settings([path]).run_config("CartPole-v1", "mace_full", 0)
+    assert (expected.meta.hidden_units, expected.memory.neighbours) == (48, 3)
+    for section in ("memory", "novelty", "meta", "beta"):
+        assert getattr(config, section) == getattr(expected, section)

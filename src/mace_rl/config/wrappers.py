@@ -11,15 +11,15 @@ from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import DEFAULTS, merge, read_yaml
 from mace_rl.config.section import Count, Section
 
-LEARNED = "learned"  # β as in the variant mace_full of config.yaml
+LEARNED, LEARNS = "learned", "mace_full"  # what stands for the β of this variant of config.yaml
 
 
 @cache
 def defaults() -> dict[str, Any]:
-    """The sections `memory`, `novelty` and `meta` of config.yaml, and how mace_full sets β."""
+    """The sections `memory`, `novelty`, `meta` and `beta` of config.yaml's mace_full."""
     config = read_yaml(DEFAULTS)
-    sections = {name: config["training"][name] for name in ("memory", "novelty", "meta")}
-    return sections | {"beta": config["variant_settings"]["mace_full"]["beta"]}
+    everything = merge(config["training"], config["variant_settings"][LEARNS])
+    return {name: everything[name] for name in ("memory", "novelty", "meta", "beta")}
 
 
 class CuriosityConfig(Section):
