@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import AfterValidator, Field, model_validator
 
 from mace_rl.config.agent import PPOConfig
-from mace_rl.config.reading import read_yaml
+from mace_rl.config.reading import Settings, read_yaml
 from mace_rl.config.section import ConfigError, Section, check, check_known
 from mace_study.compare.ledger import Answer
 from mace_study.config.labels import require_latex
@@ -188,9 +188,13 @@ def parse_claims(path: str | Path, learned: str = LEARNED) -> ClaimsConfig:
 
     The file calls that `LEARNED`. Another variant takes its place in every claim and in Table 1.
     """
-    given = read_yaml(Path(path))
+    return with_learned(read_yaml(Path(path)), learned, str(path))
+
+
+def with_learned(given: Settings, learned: str, origin: str) -> ClaimsConfig:
+    """The same from what `origin`, a file, has."""
     renamed = {key: _with_learned(given[key], learned) for key in {"families", "table1"} & {*given}}
-    return check(ClaimsConfig, {**given, **renamed}, str(path))
+    return check(ClaimsConfig, {**given, **renamed}, origin)
 
 
 def _with_learned(part: Any, learned: str) -> Any:

@@ -77,14 +77,19 @@ def find(part: Part, pairs: Sequence[Pair], margin: float, settings: MetricsConf
 def _pair(part: Part, runs: pd.DataFrame, metric: Metric | None, settings: MetricsConfig) -> Pair:
     """runs: those in one environment. Episodes beyond the shorter budget count as it."""
     environment = str(runs["env"].iloc[0])
-    both = runs[runs["variant"].isin([part.variant, part.baseline])]
-    wide = both.pivot(index="seed", columns="variant", values=part.metric).astype(np.float64)
+    both = {
+        name: runs[runs["variant"] == name].set_index("seed")
+        for name in (part.variant, part.baseline)
+        if name
+    }
+    values = {name: rows[part.metric] for name, rows in both.items()}
+    wide = pd.DataFrame(values).astype(np.float64)  # by seed
     lacking = wide.isna().to_numpy()
     if lacking.any():
         row, column = np.argwhere(lacking)[0]
         run = f"{environment}, {wide.columns[column]}, seed {wide.index[row]}"
         raise RecordError(f"{run}: there is no {part.metric}")
-    budget = int(both["episodes"].min())
+    budget = min(int(rows["episodes"].min()) for rows in both.values())
     if metric and metric.unit == "episodes":
         wide = -wide.clip(upper=budget)
     variant = wide[part.variant].to_numpy()

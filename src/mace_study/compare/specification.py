@@ -14,8 +14,9 @@ import pandas as pd
 from mace_rl.base.rng import Streams
 from mace_rl.beta.objectives import Perturbed, Progress, Score
 from mace_rl.config.beta import MetaBeta, ProgressObjective, ScoreObjective
+from mace_rl.config.reading import read_yaml
 from mace_rl.config.run import RunConfig
-from mace_study.compare.claims_config import ClaimsConfig, PartsConfig, parse_claims
+from mace_study.compare.claims_config import ClaimsConfig, PartsConfig, with_learned
 from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.metrics import CORRELATIONS
@@ -67,8 +68,9 @@ def specification(
     about a β that `MOVES`, and this does not.
     """
     rows: list[Any] = []
+    given = read_yaml(Path(claims))
     for reading, moved in deviations.items():
-        everything = parse_claims(claims, reading)
+        everything = with_learned(given, reading, str(claims))
         for whole in (True, False):
             asked = family_of(everything, set(table["env"]), whole)
             for answer in ledger(table, settings, asked):
@@ -95,8 +97,10 @@ def in_tasks(
     Columns: claim, reading, over, seeds, difference, low, high, p_holm, outcome; verdict, of all.
     """
     rows: list[Any] = []
+    given = read_yaml(Path(claims))
     for reading in readings:
-        [answer] = ledger(table, settings, alone(parse_claims(claims, reading), name))
+        everything = with_learned(given, reading, str(claims))
+        [answer] = ledger(table, settings, alone(everything, name))
         judged = answer.ways[how]
         for part in judged.parts:
             found = part.seeds, part.difference, part.low, part.high, part.p_holm, part.outcome

@@ -116,10 +116,8 @@ def _sign_flips(
     drawn, p_values = signs(repetitions, seeds, generator), np.empty(values.shape[1:])
     how |= {"n_resamples": repetitions, "batch": BATCH}
     for metric in np.ndindex(p_values.shape):  # `permutation_test` would take 25 times as long
-        column, batches = (
-            shares[:, *metric],
-            iter(np.split(drawn, range(BATCH, repetitions, BATCH))),
-        )
+        column = shares[:, *metric]
+        batches = iter(np.split(drawn, range(BATCH, repetitions, BATCH)))
         tested = scipy.stats.monte_carlo_test(
             np.ones(seeds),
             lambda size, batches=batches: next(batches),
@@ -212,12 +210,12 @@ def probability_of_improvement(
     means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
     for x, y in pairs:
         wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m, metrics]
-        drawn_x, drawn_y = (draws(len(runs), repetitions, generator) for runs in (x, y))
+        drawn_x, drawn_y = (single_draws(len(runs), repetitions, generator) for runs in (x, y))
         means += wins.mean(axis=(0, 1)) / len(pairs)
-        halves, drawn_x = wins.astype(np.float32), drawn_x.astype(np.float32)  # exact, and faster
+        halves = wins.astype(np.float32)  # of which sums of n · m are exact, and faster
         for metric in range(metrics):
             won = np.einsum("ry,ry->r", drawn_x @ halves[:, :, metric], drawn_y)
-            resampled[:, metric] += won / (len(x) * len(y) * len(pairs))
+            resampled[:, metric] += won.astype(np.float64) / (len(x) * len(y) * len(pairs))
     fewest = min(len(runs) for both in pairs for runs in both)
     low, high = percentiles(resampled, confidence, fewest)
     return means, low, high
@@ -268,6 +266,12 @@ def draws(count: int, repetitions: int, generator: np.random.Generator) -> np.nd
     drawn += count * np.arange(repetitions)[:, None]  # each sample has a range of its own
     times = np.bincount(drawn.ravel(), minlength=repetitions * count)
     return times.reshape(repetitions, count).astype(np.float64)
+
+
+@_remembered
+def single_draws(count: int, repetitions: int, generator: np.random.Generator) -> np.ndarray:
+    """`draws` as float32."""
+    return draws(count, repetitions, generator).astype(np.float32)
 
 
 @_remembered
