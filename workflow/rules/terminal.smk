@@ -51,7 +51,8 @@ def asked_for():
     due = set(workflow.dag.needrun_jobs())
     jobs = [job for job in workflow.dag.jobs if job.rule.name == "train"]
     return [
-        {**job.wildcards_dict, "work": plan.work[run_of(job.wildcards)[:2]], "due": job in due} for job in jobs
+        {**job.wildcards_dict, "work": plan.work[run_of(job.wildcards)[:2]], "due": job in due}
+        for job in jobs
     ]
 
 
