@@ -140,9 +140,8 @@ def write(path: Path, runs: Runs) -> None:
     kept = [name for name in columns if name != RETURN or not follows]
     table = pa.table(keys | {name: _packed(name, columns[name]) for name in kept})
     if follows:
-        table = table.replace_schema_metadata(
-            {FOLLOWS: json.dumps(pairs[[*END, RETURN]].to_numpy().tolist())}
-        )
+        rows = pairs[[*END, RETURN]].to_numpy().tolist()
+        table = table.replace_schema_metadata({FOLLOWS: json.dumps(rows)})
     coded = together["bits"].nunique() < REPEATED * len(together)
     split = [name for name in kept if name != "terminated" and not (name == RETURN and coded)]
     sink = pa.BufferOutputStream()

@@ -104,13 +104,9 @@ def asked(
     columns: as of `measured`.
     """
     jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
-    made = {
-        (env, name): measured(
-            folder / f"{files.folder_of(env)}.parquet", name, seeds[env], settings, columns
-        )
-        for env, name in jobs
-    }
-    found = {job: runs for job, runs in made.items() if runs}
+    paths = {env: folder / f"{files.folder_of(env)}.parquet" for env in seeds}
+    made = [measured(paths[env], name, seeds[env], settings, columns) for env, name in jobs]
+    found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
     whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
     if lacking := [name for name in baselines if name not in whole]:
         raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")

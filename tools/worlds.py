@@ -11,7 +11,6 @@ import argparse
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -26,7 +25,7 @@ from mace_study.show import worlds
 from mace_study.show.curves import PlotStyle, plot_style, quantity, save_figure
 from mace_study.show.markdown import page
 from mace_study.show.sections import Section
-from mace_study.show.tables import side_by_side
+from mace_study.show.tables import records, side_by_side
 
 # With the variant that is the learned β in each.
 WORLDS = {"tuned": LEARNED, "plain": "mace_evidence", "published": LEARNED}
@@ -91,18 +90,13 @@ def make(folder: Path) -> list[str]:
     return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
 
 
-def records(table: pd.DataFrame) -> Any:
-    """Its rows, with their columns as attributes."""
-    return table.itertuples()
-
-
 def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]:
     """The tables in words, for README.md."""
     sections = []
     ways = tables["verdicts"].groupby("measured") if "verdicts" in tables else ()
     for way, of_way in sorted(ways, key=lambda pair: pair[0] != DECIDES):
         said = [
-            f"{row.verdict}: {worlds.difference(row.difference, row.low, row.high)}"
+            f"{row['verdict']}: {worlds.difference(row['difference'], row['low'], row['high'])}"
             for row in records(of_way)
         ]
         long = of_way.assign(said=said)
@@ -120,7 +114,7 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
         + ", "
         + table["metric"].map(look.metrics).str.lower(),
         seeds=[
-            f"{row.median:.0f} ({row.low:.0f} to {row.high:.0f})" + (" *" if row.unusual else "")
+            f"{row['median']:.0f} ({row['low']:.0f} to {row['high']:.0f})" + " *" * row["unusual"]
             for row in records(table)
         ],
     )
@@ -134,21 +128,21 @@ def _sections(tables: dict[str, pd.DataFrame], look: PlotStyle) -> list[Section]
         " ([the protocol](../../worlds/protocol.md#the-table-as-a-draw))."
     )
     sections.append(Section("The paper's numbers", note, frame))
-    rows: list[dict[str, str]] = []
-    for row in records(tables["draws"]):
-        as_words = row.rule.split(" / ")[0] != AS_NAMED[0]
-        rows.append(
-            {
-                "world": row.world,
-                "metrics": "as the words say" if as_words else "as named",
-                "unusual": f"{row.unusual} of {row.numbers}",
-                "unlike from": f"{row.limit}",
-                "chance of as many": f"{row.chance_unusual:.2g}",
-                "columns": f"{row.first}",
-                "as favourable": f"{row.chance_first:.3f}",
-                "by chance": f"{row.chance_any:.3f}",
-            }
-        )
+    rows = [
+        {
+            "world": row["world"],
+            "metrics": "as named"
+            if row["rule"].startswith(AS_NAMED[0] + " /")
+            else "as the words say",
+            "unusual": f"{row['unusual']} of {row['numbers']}",
+            "unlike from": f"{row['limit']}",
+            "chance of as many": f"{row['chance_unusual']:.2g}",
+            "columns": f"{row['first']}",
+            "as favourable": f"{row['chance_first']:.3f}",
+            "by chance": f"{row['chance_any']:.3f}",
+        }
+        for row in records(tables["draws"])
+    ]
     favoured = look.labels[tables["draws"]["favoured"].iloc[0]]
     note = (
         "One seed of each variant as Table 1. *Chance of as many*: of as many unusual numbers."

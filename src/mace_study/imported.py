@@ -252,9 +252,8 @@ def main() -> None:
         runs = {path: read(path, given.returns, given.lengths) for path in given.runs}
         write(runs, given.env, given.variant, given.out)
         random = {} if given.random_return is None else {given.env: given.random_return}
-        lacking = write_study(
-            given.out, {given.variant: given.label} if given.label else {}, random
-        )
+        labels = {given.variant: given.label} if given.label else {}
+        lacking = write_study(given.out, labels, random)
     except (Refusal, OSError) as error:
         sys.exit(f"mace-import: {' '.join(str(error).split())}")
     for seed, (path, rows) in enumerate(runs.items()):

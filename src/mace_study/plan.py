@@ -16,7 +16,7 @@ from mace_rl.runs.provenance import read_record
 from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, read_claims, too_few
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import Study
-from mace_study.measure.metrics import all_metrics, out_of_reach
+from mace_study.measure.metrics import all_metrics, metric_units, out_of_reach
 
 FIGURES = ("figure1", "figure2")  # over training: 1 is the paper's, 2 shows β
 
@@ -120,10 +120,8 @@ class Plan:
     @property
     def read(self) -> bool:
         """Whether Table 1 can be read in several ways, as what counts episodes can."""
-        counted = {
-            metric.name for metric in all_metrics(self.measured) if metric.unit == "episodes"
-        }
-        return bool(counted.intersection(self.paper.table1.metrics))
+        units = metric_units(self.measured)
+        return any(units.get(name) == "episodes" for name in self.paper.table1.metrics)
 
     @cached_property
     def lacking(self) -> dict[str, list[str]]:

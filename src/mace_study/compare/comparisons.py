@@ -71,10 +71,8 @@ def _compare(
     All runs are censored at the same episode E. Restricted to E, the mean ∫₀ᴱ S(t) dt of Kaplan's
     and Meier's estimate S is then the mean of the runs, with E for those that never got there.
     """
-    (variant, baseline), metrics = (
-        pair,
-        [metric for metric in all_metrics(settings) if metric.compared],
-    )
+    variant, baseline = pair
+    metrics = [metric for metric in all_metrics(settings) if metric.compared]
     how = (settings.confidence, settings.bootstrap_repetitions)
     seed = settings.bootstrap_seed  # of a generator for each: no row depends on another
     signs = [-1 if metric.unit == "episodes" else 1 for metric in metrics]  # greater is better
@@ -90,10 +88,8 @@ def _compare(
     censored = sum(np.isinf(values).sum(axis=0) for both in reached for values in both)
     seeds = min(len(x) for x, _ in reached)
     rows = [
-        Comparison(
-            ALL, metric.name, variant, baseline, seeds, int(never), *UNTESTED, np.nan, *chances
-        )
-        for metric, never, *chances in zip(metrics, censored, *better, strict=True)
+        Comparison(ALL, metric.name, variant, baseline, seeds, int(n), *UNTESTED, np.nan, *chances)
+        for metric, n, *chances in zip(metrics, censored, *better, strict=True)
     ]
     if len(environments) > 1:
         return rows
