@@ -330,6 +330,15 @@ def test_planning_and_tabulating_import_nothing_slow(code, forbidden, backend) -
     assert "mace_study.config.metrics" in loaded and not loaded & forbidden
 
 
+def test_a_network_of_mace_full_s_own_leaves_the_published_world_alone():
+    own = changed({"variant_settings": {"mace_full": {"meta": {"hidden_units": 48}}}})
+    world = read_yaml(ROOT / "config" / "published.yaml")
+    studies = [load_study(merge(under, world), "test") for under in (PLAIN, own)]
+    plain, other = (study.run_config("CartPole-v1", "mace_full", 0) for study in studies)
+    assert plain == other
+    assert load_study(own, "test").run_config("CartPole-v1", "mace_full", 0).meta.hidden_units == 48
+
+
 def test_one_run_of_each_environment_starts_first_then_the_longest():
     given = {"environments": ["CartPole-v1", "Acrobot-v1", "HopperBulletEnv-v0"], "seeds": "3-4"}
     given["environment_settings"] = {"Acrobot-v1": {"episodes": 900}}

@@ -331,10 +331,8 @@ def test_defaults_are_the_study_s(run_config):
 
 
 def test_a_learned_beta_is_that_of_mace_full_wherever_it_is_set(tmp_path, monkeypatch, request):
-    path, own = (
-        tmp_path / "config.yaml",
-        {"meta": {"hidden_units": 48}, "memory": {"neighbours": 3}},
-    )
+    path = tmp_path / "config.yaml"
+    own = {"meta": {"hidden_units": 48}, "memory": {"neighbours": 3}}
     layers = read_yaml(wrappers.DEFAULTS), {"variant_settings": {"mace_full": own}}
     path.write_text(yaml.safe_dump(merge(*layers)))
     request.addfinalizer(defaults.cache_clear)

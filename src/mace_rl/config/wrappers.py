@@ -11,14 +11,14 @@ from mace_rl.config.bonus import MemoryConfig, NoveltyConfig
 from mace_rl.config.reading import DEFAULTS, merge, read_yaml
 from mace_rl.config.section import Count, Section
 
-LEARNED, LEARNS = "learned", "mace_full"  # what stands for the β of this variant of config.yaml
+LEARNED = "learned"  # β as in the variant mace_full of config.yaml
 
 
 @cache
 def defaults() -> dict[str, Any]:
     """The sections `memory`, `novelty`, `meta` and `beta` of config.yaml's mace_full."""
     config = read_yaml(DEFAULTS)
-    everything = merge(config["training"], config["variant_settings"][LEARNS])
+    everything = merge(config["training"], config["variant_settings"]["mace_full"])
     return {name: everything[name] for name in ("memory", "novelty", "meta", "beta")}
 
 

@@ -193,16 +193,16 @@ def parse_claims(path: str | Path, learned: str = LEARNED) -> ClaimsConfig:
 
 def with_learned(given: Settings, learned: str, origin: str) -> ClaimsConfig:
     """The same from what `origin`, a file, has."""
-    renamed = {key: _with_learned(given[key], learned) for key in {"families", "table1"} & {*given}}
+    renamed = {key: _renamed(given[key], learned) for key in {"families", "table1"} & {*given}}
     return check(ClaimsConfig, {**given, **renamed}, origin)
 
 
-def _with_learned(part: Any, learned: str) -> Any:
+def _renamed(part: Any, learned: str) -> Any:
     """Plain settings with another name for the learned β."""
     if isinstance(part, dict):
-        return {_with_learned(key, learned): _with_learned(x, learned) for key, x in part.items()}
+        return {_renamed(key, learned): _renamed(x, learned) for key, x in part.items()}
     if isinstance(part, list):
-        return [_with_learned(each, learned) for each in part]
+        return [_renamed(each, learned) for each in part]
     return learned if part == LEARNED else part
 
 

@@ -55,11 +55,11 @@ def readings(
     """The data of readings.csv: one row per environment, reading, source and variant.
 
     frames: `FinishedRun.episodes` of each run (environment, variant, seed); table: their frame of
-    metrics.csv. Columns: env,
-    kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`, or `PAPER`: its Table 1),
-    variant, mean, low, high (its interval; NaN of the paper), seeds, censored, rank (1: the lowest
-    mean, if training ended with the shortest budget of the environment's variants) and p_value: of
-    the log-rank test, not corrected, of this variant against that of rank 1.
+    metrics.csv. Columns: env, kind (of the paper's metrics), reading, source (`RUNS`, `SHUFFLED`,
+    or `PAPER`: its Table 1), variant, mean, low, high (its interval; NaN of the paper), seeds,
+    censored, rank (1: the lowest mean, if training ended with the shortest budget of the
+    environment's variants) and p_value: of the log-rank test, not corrected, of this variant
+    against that of rank 1.
     """
     asked = kinds(settings, table1)
     rules = [metric for _, metric in asked if metric.name in table1.public_code]

@@ -227,7 +227,7 @@ def save_figure(figure: Figure, *paths: str | Path) -> None:
         for path in map(Path, paths):
             if path.suffix == ".pdf":
                 unsaid = dict.fromkeys(("CreationDate", "Creator", "Producer"))
-                figure.savefig(path, metadata=unsaid)
+                figure.savefig(path, dpi=DOTS_PER_INCH, metadata=unsaid)
                 continue
             drawn = io.BytesIO()
             figure.savefig(drawn, dpi=DOTS_PER_INCH, pil_kwargs={"compress_level": 0})
