@@ -119,7 +119,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.pairs < 1:
         parser.error(f"--pairs is {arguments.pairs}, but should be at least 1")
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "src").strip()
+    paths = "src", "tools", "config", "config.yaml"
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", *paths).strip()
     revision = arguments.revision or ("HEAD" if changed else "HEAD^")
     with tempfile.TemporaryDirectory() as folder:
         archive = git("archive", revision)

@@ -1,4 +1,4 @@
-"""benchmarks/README.md of benchmarks/measurements.csv: tables of each section, and two pictures."""
+"""benchmarks/README.md of benchmarks/measurements.csv: tables of each section, and a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,8 @@ neither by hand. [docs/performance.md](../docs/performance.md) explains them.
 
 Rates and ratios are medians over the repeats, with their range in brackets. The line below each
 section's tables names its commit, which can be another one. An environment alone takes random
-actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs.
+actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs. Before commit 8a48ade
+`mace_full` was another variant: docs/performance.md says which.
 """
 RATE = "environment steps per CPU second"
 

@@ -19,6 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 
+from mace_rl.base.errors import Refusal
 from mace_rl.wrapping.wrappers import CuriosityReward
 from mace_study.compare.statistics import mean_interval, paired_comparison
 
@@ -85,8 +86,11 @@ def main() -> None:
         sys.exit(f"sb3_ppo: --environment {arguments.environment!r} cannot be made: {reason}")
     try:
         beta = arguments.beta if arguments.beta == "learned" else float(arguments.beta)
+        CuriosityReward(gymnasium.make(arguments.environment), beta).close()
     except ValueError:
         parser.error(f"--beta is {arguments.beta!r}, but should be a number or learned")
+    except Refusal as error:
+        sys.exit(f"sb3_ppo: {error}")
     torch.set_num_threads(1)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     found = np.empty((len(MEASURES), 2, len(seeds)))  # without and with curiosity

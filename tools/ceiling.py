@@ -22,8 +22,6 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-import mace_rl.base.cpu_features  # noqa: F401  # isort: skip
-
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -125,6 +123,7 @@ def main() -> None:
         parser.error(f"--seeds should be FIRST < END, and --horizon at least {max(STRETCHES)}")
     same = repeat(given.environment), seeds, repeat(given.horizon), repeat(given.config)
     try:
+        settings(given.environment, "mace_fixed", config=given.config)  # or out would be emptied
         with (
             ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool,
             given.out.open("w", newline="") as file,

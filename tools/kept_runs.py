@@ -18,8 +18,6 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
-
 import numpy as np
 import pandas as pd
 import pyarrow as pa

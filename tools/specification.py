@@ -6,6 +6,7 @@ A part of `make tables`. Only a reading all of whose runs are kept is asked.
 import json
 import statistics
 from collections.abc import Collection, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from mace_rl.base.errors import Refusal
 from mace_rl.config.run import RunConfig
 from mace_study.compare import ceiling
 from mace_study.compare.claims_config import parse_claims, parts_of
-from mace_study.compare.comparisons import ALL, comparisons
+from mace_study.compare.comparisons import comparisons
 from mace_study.compare.specification import MOVES, alone, asked_beta, in_tasks, specification
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import read_study
@@ -28,14 +29,14 @@ from mace_study.show import worlds
 from mace_study.show.curves import save_figure
 from mace_study.show.markdown import page
 from mace_study.show.sections import Section
+from mace_study.show.tables import number
 from tools import kept_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "config.yaml"
-# By world the folder that its runs are in, and the seeds of each environment.
-WORLDS = {
-    "tuned": ("tuned", dict.fromkeys(("Acrobot-v1", "CartPole-v1"), range(200, 240))),
-    "plain": ("plain", {"Acrobot-v1": range(300, 500), "CartPole-v1": range(300, 400)}),
+WORLDS = {  # the seeds of each environment
+    "tuned": dict.fromkeys(("Acrobot-v1", "CartPole-v1"), range(200, 240)),
+    "plain": {"Acrobot-v1": range(300, 500), "CartPole-v1": range(300, 400)},
 }
 # What tools.ceiling wrote, with the world of each row; its controls are tasks of these files.
 CEILING = ROOT / "reference" / "measured" / "ceiling.csv"
@@ -43,19 +44,25 @@ CONTROLS = [ROOT / "config" / "tasks.yaml", ROOT / "config" / "planted.yaml"]
 BASELINES = ("ppo", "mace_fixed")
 # By claim of ours the files of its study over config.yaml, the last also the runs' folder; seeds.
 TASKS = {"P1": (["tasks"], range(200, 220)), "G2": (["tasks", "minigrid"], range(700, 720))}
-PLANTED, HELD_OUT = ("PlantedHelp-v0", "PlantedHarm-v0"), range(320, 340)
+# By problem its kinds of episodes, which take turns. (A trial reset takes the first of the two.)
+PLANTED = {"Help": ["helps"], "Nothing": ["tells nothing"], "Harm": ["harms"]}
+PLANTED |= {"Mixed": ["mixed: harms", "mixed: helps"]}
+HELD_OUT = range(320, 340)
 DEFAULT = "mace_full"
 READINGS = (
     *(DEFAULT, "mace_score", "mace_progress", "mace_return", "mace_centred", "mace_words"),
     *("mace_credit_network", "mace_evidence"),
 )
+PLANTED_VARIANTS = (
+    *(*READINGS, "mace_constant_input", "mace_untrusting", "mace_credit", "mace_pretrained"),
+)
 DECIDES = "robust"
 
 
-def end_of_beta(run: kept_runs.Kept) -> float:
-    """The mean β that the network asks for in the last tenth of a run."""
+def end_of_beta(run: kept_runs.Kept, first: int = 0, step: int = 1) -> float:
+    """The mean β that is asked for in the last tenth of a run, in each `step`-th episode of it."""
     asked = asked_beta(run.episodes["beta"].to_numpy(), config_of(run))
-    return float(asked[-(len(asked) // 10) :].mean())
+    return float(asked[-(len(asked) // 10) :][first::step].mean())
 
 
 def config_of(run: kept_runs.Kept) -> RunConfig:
@@ -72,18 +79,27 @@ class Measured(NamedTuple):
 
 
 def measured(
-    path: Path, variant: str, seeds: range, settings: MetricsConfig, columns: Collection[str]
+    folder: Path,
+    run: tuple[str, str],
+    seeds: range,
+    settings: MetricsConfig,
+    columns: Collection[str],
 ) -> Measured | None:
-    """A variant's runs; None where some are lacking. columns: of metrics.csv and betas.csv."""
-    there = kept_runs.read(path, [variant])
+    """The runs of an environment and variant; None where some are lacking.
+
+    columns: of metrics.csv and betas.csv.
+    """
+    environment, variant = run
+    there = kept_runs.read(folder / f"{files.folder_of(environment)}.parquet", [variant])
     if not {(variant, seed) for seed in seeds} <= {*there}:
         return None
     frames, moved, first = {}, [], {}
     for seed in seeds:
-        frame, config = there[variant, seed].episodes, config_of(there[variant, seed])
-        frames[config.environment, variant, seed] = frame
+        frame = there[variant, seed].episodes
+        frames[environment, variant, seed] = frame
         first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
         if variant in READINGS:
+            config = config_of(there[variant, seed])
             moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
     metrics = [metric for metric in all_metrics(settings) if metric.name in columns]
     rows = metrics_table(frames, settings, metrics)
@@ -104,8 +120,7 @@ def asked(
     columns: as of `measured`.
     """
     jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
-    paths = {env: folder / f"{files.folder_of(env)}.parquet" for env in seeds}
-    made = [measured(paths[env], name, seeds[env], settings, columns) for env, name in jobs]
+    made = [measured(folder, job, seeds[job[0]], settings, columns) for job in jobs]
     found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
     whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
     if lacking := [name for name in baselines if name not in whole]:
@@ -130,30 +145,36 @@ def in_our_tasks(kept: Path) -> pd.DataFrame:
 
 
 def in_planted(kept: Path) -> pd.DataFrame:
-    """Which β the readings ask for where the right one is known, on held-out seeds.
+    """Which β is asked for where the right one is known, on held-out seeds, by all that set one.
 
-    Columns: env, reading, seeds, mean, above (0.8: of how many seeds), below (0.1).
+    Columns: the bonus (`PLANTED`), variant, seeds, mean, least, most (of the seeds), above (0.8: of
+    how many seeds), below (0.1), return (mean, of all training).
     """
     rows = []
-    for env in PLANTED:
-        there = kept_runs.read(kept / "planted" / f"{env}.parquet", READINGS)
-        for reading in (name for name in READINGS if (name, HELD_OUT[0]) in there):
-            ends = np.array([end_of_beta(there[reading, seed]) for seed in HELD_OUT])
-            rows.append((env, reading, len(ends), ends.mean(), sum(ends > 0.8), sum(ends < 0.1)))
-    return pd.DataFrame(rows, columns=["env", "reading", "seeds", "mean", "above", "below"])
+    for problem, kinds in PLANTED.items():
+        there = kept_runs.read(kept / "planted" / f"Planted{problem}-v0.parquet")
+        variants = [name for name in PLANTED_VARIANTS if (name, HELD_OUT[0]) in there]
+        for (first, kind), variant in product(enumerate(kinds), variants):
+            runs = [there[variant, seed] for seed in HELD_OUT]
+            ends = np.array([end_of_beta(run, first, len(kinds)) for run in runs])
+            returns = [run.episodes["extrinsic_return"].mean() for run in runs]
+            found = ends.mean(), ends.min(), ends.max(), sum(ends > 0.8), sum(ends < 0.1)
+            rows.append((kind, variant, len(ends), *found, np.mean(returns)))
+    names = ["seeds", "mean", "least", "most", "above", "below", "return"]
+    return pd.DataFrame(rows, columns=["bonus", "variant", *names])
 
 
 def make(kept: Path, goal: Path) -> list[str]:
     """Make what the module says; returns the files' names in `goal`, none if a world is lacking."""
-    if not all((kept / place).exists() for place, _ in WORLDS.values()):
+    if not all((kept / world).exists() for world in WORLDS):
         return []
     study = read_study([CONFIG])
     families = parse_claims(ROOT / study.claims).families.values()
     columns = {part.metric for family in families for _, part in parts_of(family)}
     columns |= {*metric_units(study.metrics)}  # to compare
     found, compared, moved, earned = [], [], {}, []
-    for world, (place, seeds) in WORLDS.items():
-        runs = asked(kept / place, seeds, study.metrics, BASELINES, columns)
+    for world, seeds in WORLDS.items():
+        runs = asked(kept / world, seeds, study.metrics, BASELINES, columns)
         table = pd.concat([of_env.rows for of_env in runs.values()], ignore_index=True)
         by_reading: dict[str, list[float]] = {}
         for (_, name), of_env in runs.items():
@@ -166,8 +187,8 @@ def make(kept: Path, goal: Path) -> list[str]:
         answers = specification(table, study.metrics, ROOT / study.claims, moved[world], DECIDES)
         found.append(answers.assign(world=world))
         pairs = [[name, other] for name in moved[world] for other in BASELINES]
-        over = comparisons(table, study.metrics.model_copy(update={"comparisons": pairs}))
-        compared.append(over[over["env"] != ALL].assign(world=world))
+        asked_for = study.metrics.model_copy(update={"comparisons": pairs})
+        compared.append(comparisons(table, asked_for, together=False).assign(world=world))
     forks, metrics = pd.read_csv(CEILING), read_study([CONFIG, *CONTROLS]).metrics
     tables = {
         "specification": pd.concat(found, ignore_index=True),
@@ -242,7 +263,7 @@ def of_ceiling(gains: pd.DataFrame, effects: pd.DataFrame) -> list[Section]:
 
 def span(row: pd.Series, name: str, digits: int) -> str:
     """A value with its interval."""
-    value, low, high = (f"{row[key]:.{digits}f}".replace("-", "−") for key in (name, "low", "high"))
+    value, low, high = (number(row[key], digits) for key in (name, "low", "high"))
     return f"{value} ({low} to {high})"
 
 
@@ -256,13 +277,15 @@ def of_tasks(tasks: pd.DataFrame, planted: pd.DataFrame) -> list[Section]:
         "P1: mean return of training over five tasks in which no constant is good in all; G2: over"
         " MiniGrid's four. As shares of what solving gives; *p* is corrected for a reading's parts."
     )
-    ends = planted.assign(mean=planted["mean"].map("{:.3f}".format))
+    digits = dict.fromkeys(("mean", "least", "most"), "{:.3f}") | {"return": "{:.1f}"}
+    ends = planted.assign(**{name: planted[name].map(how.format) for name, how in digits.items()})
     what = (
-        "Means over the last tenth of training, seeds 320 to 339: of how many above 0.8, below 0.1."
+        "By what the bonus does. β: the mean over the last tenth of training. Above, below: in how"
+        " many of seeds 320 to 339 it is above 0.8, below 0.1. Return: mean of all training."
     )
     return [
         Section("Where the weight matters", note, shown.map(str)),
-        Section("Planted problems: the β that is asked for", what, ends.map(str)),
+        Section("Planted problems: the β that is asked for", what, ends.astype(str)),
     ]
 
 

@@ -22,8 +22,6 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-import mace_rl.base.cpu_features  # noqa: F401  isort: skip  (before NumPy: equal bits on every processor)
-
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
@@ -80,9 +78,9 @@ def _make(name: str) -> tuple[int, list[str]]:
     frames, records = kept(plan, KEPT / ELSEWHERE.get(name, name))
     made = folder, plan.with_episodes, plan.measured
     command = shlex.join(["snakemake", "all", "--configfile", *given])
-    papers = plan.read and plan.has_papers
+    papers = "readings" in plan.tabulated
     pictures = [name for name in plan.pictures if name != "readings" or papers]
-    results.measure(frames, plan.measured, folder, FIGURES, plan.paper if papers else None)
+    results.measure(frames, plan.measured, folder, FIGURES, plan.paper if papers else None, False)
     results.tabulate(*made, plan.paper, study.labels)
     results.write_table2(folder, plan.ppo_settings(), plan.paper)
     if plan.judged:

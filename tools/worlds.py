@@ -1,6 +1,6 @@
 """What the worlds of reference/worlds/protocol.md say together, from what Snakemake made in each.
 
-    python -m tools.worlds FOLDER      for example results/worlds; `make tables` does it, too
+    python -m tools.worlds FOLDER      for example results; `make tables` does it, too
 
 FOLDER/WORLD has the metrics.csv and figure1.csv of each of `WORLDS` that is there, and its
 claims.json once all its environments are. Into FOLDER/worlds come the verdicts of these, the
@@ -174,7 +174,7 @@ def _runs(folder: Path, world: str, variants: Iterable[str]) -> pd.DataFrame:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="example: python -m tools.worlds results/worlds"
+        description=__doc__.splitlines()[0], epilog="example: python -m tools.worlds results"
     )
     parser.add_argument("folder", type=Path, help="where the worlds' folders are")
     folder = parser.parse_args().folder

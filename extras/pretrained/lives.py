@@ -29,7 +29,6 @@ Choice = Callable[[Gauge], float]  # β after a window
 class Branch:
     """A point of a life: what was seen so far, and what was still earned under each β of `GRID`."""
 
-    task: int
     seen: list[list[float]]  # the features of each window
     earned: list[float]  # per episode of the whole budget, in units of solving the task
 
@@ -39,8 +38,8 @@ class Chosen(Stateful, BetaController):
 
     STATE = ("gauge", "now")
 
-    def __init__(self, episodes: int, choose: Choice, initial: float = 0.4) -> None:
-        self.gauge, self.choose, self.now = Gauge(episodes), choose, initial
+    def __init__(self, episodes: int, choose: Choice) -> None:
+        self.gauge, self.choose, self.now = Gauge(episodes), choose, 0.4
 
     def next_beta(self) -> float:
         """See `BetaController`."""
@@ -121,7 +120,7 @@ def branches(number: int, seed: int, choose: Choice | None, count: int = 2) -> l
             gauge = trainer.controller.gauge
             if points and len(gauge.windows) >= points[0]:
                 points.pop(0)
-                found.append(Branch(number, [*gauge.windows], futures(config, trainer)))
+                found.append(Branch([*gauge.windows], futures(config, trainer)))
             if not points:
                 return found
     return found

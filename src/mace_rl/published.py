@@ -91,9 +91,9 @@ class Critic(Actor):
 class PublishedMetaNetwork(nn.Module):
     """An episode's steps, [1, T, inputs] → [1, 1], of which β is the logistic function."""
 
-    def __init__(self, inputs: int, dropout: bool, units: int = 128) -> None:
+    def __init__(self, inputs: int, dropout: bool) -> None:
         super().__init__()
-        little, more = 0.1 * dropout, 0.15 * dropout
+        units, little, more = 128, 0.1 * dropout, 0.15 * dropout
         self.begin = nn.Sequential(*layer(inputs, units, little))
         self.lstm = nn.LSTM(units, units, 3, batch_first=True, dropout=more, bidirectional=True)
         attention = [

@@ -178,12 +178,12 @@ def _depth(layer: Any, location: Iterable[Any]) -> int:
     return depth
 
 
-def check_name(environment: str, key: str) -> None:
+def check_name(name: str, key: str) -> None:
     """`ConfigError` unless the name of an environment or a variant can be a folder's."""
     extra = rf"({SAFE_NAME}:)?({SAFE_NAME}/)?" if key == "environment" else ""
-    if not re.fullmatch(rf"{extra}{SAFE_NAME}", environment) or len(environment) > 200:
+    if not re.fullmatch(rf"{extra}{SAFE_NAME}", name) or len(name) > 200:
         raise ConfigError(
-            f"{key} has {short_repr(environment)}, but a name here becomes a folder: it should be "
+            f"{key} has {short_repr(name)}, but a name here becomes a folder: it should be "
             "up to 200 letters, digits, '.', '_' and '-', and begin with a letter or digit; before "
             "an environment's may stand a module and ':', then a namespace and '/'"
         )

@@ -163,6 +163,7 @@ def write(runs: Mapping[Path, Sequence[Row]], environment: str, variant: str, ou
             "sources": "",  # ... of the code ...
             "machine": {},  # ... and of where it ran
             "seconds": rows[-1].ended,
+            "start_seconds": 0.0,
             "outputs": {files.EPISODES: provenance.file_digest(folder / files.EPISODES)},
         }
         check(provenance.RunRecord, content, str(folder))

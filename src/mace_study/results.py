@@ -40,21 +40,25 @@ def measure(
     folder: Path,
     figures: Iterable[str],
     paper: ClaimsConfig | None,
+    every_seed: bool = True,
 ) -> None:
     """metrics.csv, betas.csv, the curves of the figures, and the readings of `paper`'s Table 1.
 
-    frames: the records of each run; paper: None without readings.csv.
+    frames: the records of each run; paper: None without readings.csv; every_seed: False to write
+    the curves of single seeds only where the figure shows some.
     """
-    from mace_study.show.curves import mean_curves, quantity, seed_curves  # draws: a second
+    from mace_study.show import curves  # draws: a second
 
     table = metrics_table(frames, settings)
     write_table(folder / "metrics.csv", table)
     write_table(folder / "betas.csv", betas_table(frames, settings))
     for figure in figures:
-        shown = quantity(figure.removeprefix("figure"), settings)
-        seeds = seed_curves(frames, shown)
-        write_table(folder / f"{figure}_seeds.csv", seeds)
-        write_table(folder / f"{figure}.csv", mean_curves(seeds, shown, settings))
+        shown = curves.quantity(figure.removeprefix("figure"), settings)
+        seeds = curves.seed_curves(frames, shown)
+        means = curves.mean_curves(seeds, shown, settings)
+        write_table(folder / f"{figure}.csv", means)
+        if every_seed or curves.shows_seeds(means):
+            write_table(folder / f"{figure}_seeds.csv", seeds)
     if paper is not None:
         write_table(folder / "readings.csv", readings(frames, table, settings, paper.table1))
 
@@ -154,7 +158,10 @@ def draw(
             figure = picture.draw(table, look)
         else:
             shown = curves.quantity(name.removeprefix("figure"), settings)
-            paths = [folder / f"{name}{end}.csv" for end in ("", "_seeds")]
-            means, seeds = map(read_made, paths)
+            means = read_made(folder / f"{name}.csv")
+            columns = ["env", "variant", "seed", "episode", shown.name]
+            seeds = pd.DataFrame(columns=columns)
+            if curves.shows_seeds(means):
+                seeds = read_made(folder / f"{name}_seeds.csv")
             figure = curves.draw_figure(means, seeds, shown, look)
         curves.save_figure(figure, *(folder / f"{name}.{kind}" for kind in kinds))

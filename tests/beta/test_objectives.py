@@ -28,7 +28,8 @@ def slopes(objective, returns, output: float = 0.3) -> list[float]:
     """dL/do after each episode of these returns, played with β = 0.3; NaN where nothing is said."""
     found = []
     for extrinsic_return in returns:
-        lesson = objective.after_episode(Played(SEQUENCE, output, 0.3, float(extrinsic_return)))
+        asked = SEQUENCE, output, objective.logit(output), 0.3
+        lesson = objective.after_episode(Played(*asked, float(extrinsic_return)))
         found.append(math.nan if lesson is None else lesson.slope)
     return found
 
@@ -147,7 +148,7 @@ def test_the_network_learns_what_its_objective_says(run_config, variant):
         controller.next_episode(episode, bonus)
         if read is not None:
             total = float(sum(episode.rewards.tolist()))
-            lesson = twin.objective.after_episode(Played(read, output, betas[-1], total))
+            lesson = twin.objective.after_episode(Played(read, output, added, betas[-1], total))
             if lesson is not None:
                 perturbed = hasattr(twin.objective, "trace")  # a β acts after its episode
                 assert lesson.sequences == [before if perturbed else read]

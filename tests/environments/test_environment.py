@@ -33,6 +33,7 @@ def play(environment: Environment) -> Episode:
         ({"action_space": Box(0, 9, (1,), np.int64)}, 10, "of integers"),
         ({"action_space": Discrete(10**9)}, 10, "has 1000000000 numbers"),
         ({"action_space": Box(-1, 1, (200,))}, 10**6, "time limit is 1000000, not up to 500000"),
+        ({"action_space": MultiBinary(200)}, 10**6, "200 numbers in an action.*up to 500000"),
         ({"observation_space": Tuple([Dict(a=Dict({}))])}, 10, r"\[0\]\['a'\] is of Dict"),
         (None, 10, ""),
     ],

@@ -61,7 +61,7 @@ def test_where_beta_has_no_effect_the_oracle_gains_nothing(monkeypatch):
     gains, chosen = [], []
     for seed in range(800, 830):
         config = settings("CartPole-v1", "mace_fixed", seed=seed, novelty=novelty)
-        mean, forks = ceiling.oracle(config, 10)
+        mean, forks = ceiling.oracle(config, 4)
         constant = ceiling.with_beta(config.model_copy(update={"episodes": 9}), 0.4)
         expected = ceiling.returns(finish(constant), 0).mean()
         gains.append(mean - expected)
@@ -69,14 +69,6 @@ def test_where_beta_has_no_effect_the_oracle_gains_nothing(monkeypatch):
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
     assert abs(np.mean(gains)) < 2 * error
     assert np.mean(chosen) > 2 * error  # by which chance alone seems to gain
-
-
-def test_a_mistake_gets_one_line(monkeypatch, capsys, tmp_path):
-    words = ["ceiling", "CartPole-v1", str(tmp_path / "x.csv"), "--seeds", "3", "3"]
-    monkeypatch.setattr("sys.argv", words)
-    with pytest.raises(SystemExit):
-        ceiling.main()
-    assert "--seeds should be FIRST < END" in capsys.readouterr().err
 
 
 def rows_by_hand(seeds: int = 5) -> pd.DataFrame:

@@ -5,6 +5,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -130,11 +131,15 @@ def test_another_paper_has_its_tables_verdicts_and_pictures(folder):
         ("grid_counts.py", "(states)])", "(states)][:1])", "the novelty is float64 of shape (1,)"),
         ("linear_decay.py", "return self", "return [1] or self", "β is int64 of shape"),
         ("layer_norm.py", "    return ", "    return None and ", "which returned None"),
+        ("layer_norm.py", "inputs = size", "", "in a trial of 'layer_norm:network': Runt"),
+        ("grid_counts.py", "cell, {}", "{}[cell], {}", "in making 'grid_counts:GridCounts': KeyE"),
     ],
 )
 def test_mistakes_get_one_line(folder, monkeypatch, file, old, new, message):
     replace(folder / file, old, new)
     name = Path(file).stem
+    monkeypatch.setenv("TMPDIR", str(folder))  # where a traceback is kept
+    monkeypatch.setattr(tempfile, "tempdir", None)
     assert message in refusal(monkeypatch, *shlex.split(TRAININGS[name]))
     assert not (folder / name / "episodes.csv").exists()
 

@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import sys
 
 import gymnasium
 import numpy as np
@@ -71,6 +72,10 @@ def test_a_package_counts_as_a_whole(run_config, tmp_path, monkeypatch):
     run.run(config, tmp_path / "run")
     (tmp_path / "own" / "shared_part.py").write_text("x = 1\n")
     with refused(Refusal, r"holds a finished run of other code, in own\.rule:Rule"):
+        run.run(config, tmp_path / "run")
+    (tmp_path / "own" / "__init__.py").write_text("x =\n")
+    del sys.modules["own"], sys.modules["own.rule"]
+    with refused(ConfigError, "own.rule:Rule', which cannot be imported: SyntaxError: "):
         run.run(config, tmp_path / "run")
 
 

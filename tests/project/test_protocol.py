@@ -10,11 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from invented import ROBUST, ROOT
+from pyarrow import parquet
 
 from mace_rl.config.plugins import load
 from mace_rl.config.run import RunConfig
 from mace_study.config.study import Study, read_study
-from tools import kept_runs, specification, tables
+from tools import specification, tables
 
 # By the commit that runs name: their protocol as it lies there, and where it lies today.
 PROTOCOLS = {
@@ -67,9 +68,9 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
 def kept(folder: Path) -> dict[tuple[str, str, int], dict]:
     """run.json of every kept run."""
     records = [
-        json.loads(run.record)
+        json.loads(record)
         for path in sorted(folder.glob("*.parquet"))
-        for run in kept_runs.read(path).values()
+        for record in parquet.read_table(path, columns=["record"])["record"].to_pylist()
     ]
     return {
         tuple(record["config"][key] for key in ("environment", "variant", "seed")): record
@@ -79,12 +80,10 @@ def kept(folder: Path) -> dict[tuple[str, str, int], dict]:
 
 def as_low(steps: np.ndarray) -> float:
     """How likely a sum of whole numbers is as low as this one, if their signs may be flipped."""
-    chances = np.zeros(2 * np.abs(steps).sum() + 1)
-    middle = len(chances) // 2
-    chances[middle] = 1  # a sum of 0, of no seed yet
-    for step in steps:
-        chances = (np.roll(chances, step) + np.roll(chances, -step)) / 2
-    return chances[: middle + steps.sum() + 1].sum()
+    chances = np.ones(1)  # of a sum of 0, of no seed yet, which is in the middle
+    for step in sorted(np.abs(steps)):
+        chances = (np.pad(chances, (2 * step, 0)) + np.pad(chances, (0, 2 * step))) / 2
+    return chances[: len(chances) // 2 + steps.sum() + 1].sum()
 
 
 def by_all_patterns(part: dict, kind: str, runs: pd.DataFrame, study: Study) -> float:

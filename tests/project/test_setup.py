@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ if [[ -n ${BREAK-} && "$*" == *$BREAK* ]]; then
     exit 1
 fi
 case "$*" in
-"-m venv "*) folder=${!#}; mkdir -p "$folder/bin" && cp "$0" "$folder/bin/python" && sleep 0.2 ;;
+"-m venv "*) bin=${!#}/bin; mkdir -p "$bin" && cp "$0" "$bin/python" && sleep "${SLOW-0}" ;;
 "-m pip check") echo "${CHECK_SAYS-}" && [[ -z ${CHECK_SAYS-} ]] ;;
 esac
 """
@@ -92,7 +93,8 @@ def test_setup_that_breaks_off_is_not_taken_for_complete(checkout, where, kills)
 
 def test_setups_at_once_make_one_environment(checkout):
     with ThreadPoolExecutor(3) as pool:
-        assert [code for code, *_ in pool.map(make, [checkout] * 3)] == [0, 0, 0]
+        at_once = pool.map(partial(make, SLOW="0.2"), [checkout] * 3)
+        assert [code for code, *_ in at_once] == [0, 0, 0]
     assert (checkout.parent / "calls").read_text().count("-m venv --clear .venv\n") == 1
 
 

@@ -15,7 +15,7 @@ from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.library import settings
 from mace_rl.runs import run
 from mace_study.config.study import read_study
-from tools import kept_runs, random_return, schema, tables, worlds
+from tools import ceiling, kept_runs, random_return, schema, tables, worlds
 
 
 def test_editors_are_told_what_a_configuration_may_be() -> None:
@@ -106,15 +106,19 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path, monkeypatch,
         (tables, ["--cores", "0"], "--cores is '0', but should be all, or at least 1"),
         (tables, ["--cores", "two"], "--cores is 'two', but should be all, or at least 1"),
         (worlds, ["nowhere"], "worlds: nowhere has no tuned/metrics.csv"),
+        (ceiling, ["A-v1", "kept", "--seeds", "3", "3"], "--seeds should be FIRST < END"),
+        (ceiling, ["A-v1", "kept"], "ceiling: environment has 'A-v1', which is not in"),
     ],
 )
 def test_a_tool_refuses_in_one_line_in_any_folder(
     monkeypatch, capsys, tmp_path, tool, words, said
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").write_text("of another time")
     monkeypatch.setattr("sys.argv", [tool.__name__, *words])
     with pytest.raises(SystemExit) as ended:
         tool.main()
+    assert (tmp_path / "kept").read_text() == "of another time"
     assert said in f"{capsys.readouterr().err}{ended.value}"
 
 

@@ -162,12 +162,12 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
 ):
     draws = (lambda **given: Offers(Draws(**given))) if kind == "wrapper" else Draws
     name = kind if "-v" in kind else register("Draws-v0", draws, 5, kind=kind)
-    config = run_config(name, "ppo", 0, episodes=30, max_episode_steps=60 if "-v" in kind else 5)
+    config = run_config(name, "ppo", 0, episodes=23, max_episode_steps=60 if "-v" in kind else 5)
     checkpoint_every(1)
     for folder in ("killed", "whole"):
         seed_all(1)
         if folder == "killed":
-            kill(29, config, tmp_path / folder)
+            kill(22, config, tmp_path / folder)
             seed_all(2)  # another process
         run.run(config, tmp_path / folder)
     (interruption,) = provenance_of(tmp_path / "killed")["interruptions"]

@@ -240,4 +240,10 @@ def test_an_unfinished_run_that_left_nothing_starts_over_in_words(run_config, tm
     caplog.set_level(logging.INFO)
     (tmp_path / LOCK).write_bytes(run.CLAIM)
     run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path)
-    assert f"starting over: what was trained in {tmp_path} left no checkpoint" in caplog.text
+    said = f"starting over: what was trained in {tmp_path} left no checkpoint"
+    assert said in caplog.text
+    (tmp_path / "checkpoint.pt").write_bytes(b"cut off")
+    (tmp_path / "run.json").unlink()
+    caplog.clear()
+    run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path, aside="all")
+    assert "set aside in" in caplog.text and said not in caplog.text

@@ -47,7 +47,7 @@ def test_importing_loads_little_and_changes_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["mace_rl.cli", "tools", "mace_rl.base.cpu_features"])
+@pytest.mark.parametrize("module", ["mace_rl.cli", "tools"])
 def test_the_commands_pin_what_numpy_and_torch_compute_with(module):
     numpy_has, torch_has = told(
         f"import {module}, json, torch; from numpy._core._multiarray_umath import __cpu_features__;"

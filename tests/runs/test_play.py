@@ -271,3 +271,6 @@ def test_what_cannot_be_filmed_is_said(trained, tmp_path, register):
             watch.film(trained(name, episodes=2))
     shutil.copy(trained("CartPole-v1", episodes=2) / files.RECORD, tmp_path)
     assert watch.film(tmp_path, untrained=True).pictures  # needs no weights but the first
+    wrappers = {"environment_wrappers": ["gymnasium.wrappers:NormalizeObservation"]}
+    normalised = trained("CartPole-v1", episodes=2, **wrappers)
+    assert watch.film(normalised, untrained=True, trust=True).pictures  # nor numbers of a wrapper

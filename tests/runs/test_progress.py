@@ -80,12 +80,14 @@ def test_runs_without_a_workflow(tmp_path: Path) -> None:
     folder.add("A", record=DONE | {"config": named})
     folder.add("B", told=told(50, 60.0) | named, held=True)
     folder.add("C", told=told(90, 60.0) | named)
+    folder.add("D", record=DONE | {"config": named}, told=told(50, 60.0) | named, held=True)
     heading, names, *rows = [" ".join(line.split()) for line in status(tmp_path)]
-    assert heading == "1 of 3 runs done, 1 running, 1 stopped; about 60 s left"
+    assert heading == "1 of 4 runs done, 2 running, 1 stopped; about 60 s left"
     assert names == "folder environment variant seed episode return β steps/s left"
     assert rows == [
         "runs/B/ppo/seed1 E ppo 3 50/100 21.5 0.25 1830 60 s",
         "runs/C/ppo/seed2 E ppo 3 90/100 21.5 0.25 1830 stopped",
+        "runs/D/ppo/seed3 E ppo 3 50/100 21.5 0.25 1830 60 s",  # done, it goes on
     ]
 
 

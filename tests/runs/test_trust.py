@@ -158,7 +158,7 @@ RECORDS = [  # a text of run.json, another in its place, and what is said
     (r"\A.*\Z", "{", "not readable"),
     (r"\A.*\Z", "[" * 10**5, "not readable: maximum recursion"),
     (r"\A.*\Z", '{"a": ' + "1" * 5000 + "}", "not readable: Exceeds the limit"),
-    (r"\A.*\Z", "[]", "the configuration is |"),
+    (r"\A.*\Z", "[]", "should be a valid dictionary"),
     (r"\A.*\Z", '{"config": {"environment": 1}}', "config.environment is 1, but should be a valid"),
     (r'"outputs": \{.*?\}', '"outputs": 3', "outputs is 3, but"),
     ('"ppo"', '"a,b"', "config.variant is 'a,b', but"),

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from shared import ROOT, call, refusal
 
+from mace_rl.runs import progress
 from mace_rl.runs.finished import FinishedRun
 from mace_study import imported
 
@@ -96,6 +97,7 @@ def test_only_runs_that_each_variant_has_are_in_the_study(monkeypatch, tmp_path,
     brought(2, "b")
     assert "not in the study, since another variant lacks it: A-v0 a 2" in capsys.readouterr().out
     brought(1, "a")  # again
+    assert progress.status(out) == ["3 of 3 runs done"]
     assert "not in the study, since another variant lacks it: A-v0 b 1" in capsys.readouterr().out
     place = out / "runs" / "CartPole-v1" / "ppo" / "seed0"
     shutil.copytree(trained(episodes=5), place)

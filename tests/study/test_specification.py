@@ -123,3 +123,4 @@ def test_the_end_of_a_run_is_its_last_tenth(run_config):
     record = json.dumps({"config": config.settings()})
     betas = pd.DataFrame({"beta": np.repeat([0.9, 0.2, 0.5], [26, 2, 2])})
     assert end_of_beta(Kept(record, betas)) == pytest.approx((0.2 + 0.5 + 0.5) / 3)
+    assert end_of_beta(Kept(record, betas), 1, 2) == pytest.approx(0.5)  # of every other episode

@@ -105,6 +105,7 @@ seeds: [4294967296]  # seeds.0, 4294967296
 environment_variants: {CartPole-v1: [mace_score]}  # environment_variants.CartPole-v1, ppo
 environment_variants: {CartPole-v1: [mace_ful]}  # environment_variants.CartPole-v1, 'mace_ful'
 seeds: 5-3  # seeds, '5-3', FIRST-LAST
+seeds: 3-  # seeds, '3-', FIRST-LAST
 environment_seeds: {HopperBulletEnvv0: [3]}  # environment_seeds, 'HopperBulletEnvv0', nearest
 results: 2024.10  # results, 2024.1, text, quotes
 results: LONG  # results, 'xxx, at most 255

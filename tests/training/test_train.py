@@ -365,7 +365,7 @@ OTHERS = read_study([ROOT / "config.yaml", ROOT / "examples" / "environments.yam
 )
 def test_any_environment_trains(run_config, environment, variant, changes):
     if changes is None:
-        config = OTHERS.run_config(environment, variant, 0)
+        config = OTHERS.run_config(environment, variant, 0, {"max_episode_steps": 200})
     else:
         config = run_config(environment, variant, 0, **{"episodes": 6} | changes)
     trainer = finish(config)

@@ -270,12 +270,12 @@ def test_an_entry_holds_as_many_runs_as_two_hours_do(minutes: int, expected: str
 
 
 @pytest.mark.slow
-def test_a_thousand_short_runs_are_some_dozen_entries() -> None:
+def test_hundreds_of_short_runs_are_a_dozen_entries() -> None:
     command = [sys.executable, "-m", "snakemake", "-n", "all", "--workflow-profile", str(PROFILE)]
-    command += ["--config", "environments=[CartPole-v1]", f"seeds={[*range(334)]}".replace(" ", "")]
+    command += ["--config", "environments=[CartPole-v1]", "seeds=0-83"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     runs = re.findall(r"^ +rule train:$", done.stdout + done.stderr, re.MULTILINE)
     entries = re.findall(r"Group job runs_(\d+) ", done.stdout + done.stderr)
-    # 334 runs of PPO, 40 to an entry, and 668 with a bonus, 20 to an entry.
-    assert len(runs) == 1002
-    assert sorted(entries) == ["20"] * 34 + ["40"] * 9
+    # 84 runs of PPO, 40 to an entry, and 168 with a bonus, 20 to an entry.
+    assert len(runs) == 252
+    assert sorted(entries) == ["20"] * 9 + ["40"] * 3

@@ -41,6 +41,8 @@ SMALL = {
 }
 LIMITS = {"low": 0.2, "high": 0.7}
 RANDOM = {"kind": "custom", "rule": "extras.random_beta:RandomBeta", "arguments": LIMITS}
+SCORE = {"kind": "score", "window": 2, "noise": 2.0, "lag": 30.0, "recent": 100}
+OFTEN = {"kind": "meta", "initial": 0.4, "objective": SCORE}  # β is perturbed otherwise
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 
@@ -245,15 +247,20 @@ def test_a_learned_beta_is_what_the_network_makes_of_the_same_episodes():
 
 @pytest.mark.parametrize("mode", [NEXT, SAME])
 def test_what_the_network_learns_of_an_episode_has_its_own_beta(monkeypatch, mode):
-    """Though others have begun and ended since it was asked for."""
-    learned, after = [], Score.after_episode
+    """And perturbation, though others have begun and ended since it was asked for."""
+    learned, signs, after = [], [], Score.after_episode
 
     def noted(objective, played):
         learned.append((played.beta, played.extrinsic_return))
-        return after(objective, played)
+        before = objective.trace
+        lesson = after(objective, played)
+        signs.append((objective.trace - before) * objective.config.lag + before)
+        own = math.log(played.beta / (1 - played.beta)) - math.log(0.4 / 0.6) - played.output
+        assert own == pytest.approx(2 * signs[-1], abs=1e-3)
+        return lesson
 
     monkeypatch.setattr(Score, "after_episode", noted)
-    env = VectorCuriosityReward(vector_of("CartPole-v1", 3, mode), "learned")
+    env = VectorCuriosityReward(vector_of("CartPole-v1", 3, mode), OFTEN)
     sums, played = np.zeros(3), []
     for _, _, terminated, truncated, info in play(env, 600):
         sums += info["reward_extrinsic"]

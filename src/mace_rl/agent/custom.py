@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from mace_rl.config.agent import TorchModule
-from mace_rl.config.plugins import make
+from mace_rl.config.plugins import make, noted
 from mace_rl.config.section import ConfigError
 
 
@@ -29,8 +29,9 @@ def custom_module(
         kind = torch.nn.Module
         module = make(name, key, kind, True, inputs, outputs, hidden_units, **arguments).float()
         trial = torch.randn(2, inputs)  # not 0, which a dropout before any bias would keep
-        shapes = [tuple(module(trial).shape), (2, outputs)]
-        same = torch.equal(module(trial), module(trial))
+        with noted(f"a trial of {name!r}"):
+            first, second = module(trial), module(trial)
+            shapes, same = [tuple(first.shape), (2, outputs)], torch.equal(first, second)
         learns = {parameter.requires_grad for parameter in module.parameters()} == {True}
     for problem, found in {
         f"gives {shapes[0]} for inputs (2, {inputs}), not {shapes[1]}": shapes[0] != shapes[1],

@@ -55,6 +55,21 @@ def log_probs(outputs, log_std, actions, parts):
 
 
 @kernel
+def softmax_gradient(logits, chosen, weight, entropy_weight, grad):
+    """Of weight · log π(chosen) + entropy_weight · H at `logits`, into `grad`, 0 before; H."""
+    log_total, entropy = log_sum_exp(logits), f32(0)
+    for i in range(len(logits)):
+        log_prob = logits[i] - log_total
+        grad[i] = exp(log_prob)
+        entropy -= grad[i] * log_prob
+    for i in range(len(logits)):
+        log_prob = logits[i] - log_total
+        grad[i] *= -(weight + entropy_weight * (log_prob + entropy))
+    grad[chosen] += weight
+    return entropy
+
+
+@kernel
 def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_log_std, parts):
     """Gradient of Σ_n (w_n log π(a_n|s_n) + entropy_weight · H(π(·|s_n))) at outputs and log_std.
 
@@ -66,17 +81,10 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
     entropies = np.empty(len(outputs))
     if actions.ndim == 1:
         for n in range(len(actions)):
-            logits = outputs[n]
-            log_total, entropy = log_sum_exp(logits), f32(0)
-            for j in range(len(logits)):
-                log_prob = logits[j] - log_total
-                grad[n, j] = exp(log_prob)
-                entropy -= grad[n, j] * log_prob
-            entropies[n] = entropy
-            for j in range(len(logits)):
-                log_prob = logits[j] - log_total
-                grad[n, j] *= -(weights[n] + entropy_weight * (log_prob + entropy))
-            grad[n, actions[n]] += weights[n]
+            logits, grad_logits = outputs[n], grad[n, : outputs.shape[1]]
+            entropies[n] = softmax_gradient(
+                logits, actions[n], weights[n], entropy_weight, grad_logits
+            )
     elif len(parts):
         entropies[:] = 0
         first = 0
@@ -84,15 +92,9 @@ def log_prob_gradient(outputs, log_std, actions, weights, entropy_weight, grad_l
             end = first + parts[j]
             for n in range(len(actions)):
                 logits, grad_logits = outputs[n, first:end], grad[n, first:end]
-                log_total, entropy = log_sum_exp(logits), f32(0)
-                for i in range(len(logits)):
-                    grad_logits[i] = exp(logits[i] - log_total)
-                    entropy -= grad_logits[i] * (logits[i] - log_total)
-                entropies[n] += entropy
-                for i in range(len(logits)):
-                    log_prob = logits[i] - log_total
-                    grad_logits[i] *= -(weights[n] + entropy_weight * (log_prob + entropy))
-                grad_logits[int(actions[n, j])] += weights[n]
+                entropies[n] += softmax_gradient(
+                    logits, int(actions[n, j]), weights[n], entropy_weight, grad_logits
+                )
             first = end
     else:
         entropies[:] = 0

@@ -11,14 +11,11 @@ from mace_rl.agent.distribution import (
     sample_gaussian,
     sample_parts,
 )
-from mace_rl.environments.actions import Actions
+from mace_rl.environments.actions import Action, Actions
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.network import Network
 from mace_rl.numerics.network_kernels import forward
 from mace_rl.numerics.normaliser import Normalisation, normalise
-
-# From 0; int64 [parts], from 0; or float32 [actions] before clipping to the bounds.
-Action = int | np.ndarray
 
 
 class Policy:

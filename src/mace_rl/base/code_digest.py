@@ -53,9 +53,13 @@ def meaning(file: Path) -> bytes:
     return ast.dump(tree).encode()
 
 
-@cache  # the code in this process is what it was when it was imported
 def _lines(part: str) -> list[str]:
-    return [_line(file, meaning(file)) for file in files(part)]
+    return [_own_line(file) for file in files(part)]
+
+
+@cache  # the code in this process is what it was when it was imported
+def _own_line(file: Path) -> str:
+    return _line(file, meaning(file))
 
 
 def _line(file: Path, content: bytes) -> str:

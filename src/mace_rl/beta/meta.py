@@ -43,15 +43,17 @@ class MetaAdaptation(Stateful, BetaController):
             from mace_rl.beta.torch_network import TorchMetaNetwork as kind
         self.network = kind(config, self.reader.inputs, generator)
         self.sequence: np.ndarray | None = None  # what was read for the next β
-        self.asked: tuple[np.ndarray, float, float] | None = None  # what was read, o and β
+        # What was read, o, what that added to the logit, and β.
+        self.asked: tuple[np.ndarray, float, float, float] | None = None
 
     def next_beta(self) -> float:
         self.asked = None
         if self.sequence is None:  # the first episode's β is given
             return beta_of(self.initial_logit)
         output = self.network.output(self.sequence)
-        beta = beta_of(self.initial_logit + self.objective.logit(output))
-        self.asked = self.sequence, output, beta
+        added = self.objective.logit(output)
+        beta = beta_of(self.initial_logit + added)
+        self.asked = self.sequence, output, added, beta
         return beta
 
     def next_episode(self, episode: Episode, bonus: np.ndarray) -> None:

@@ -33,6 +33,7 @@ class Played(NamedTuple):
 
     sequence: np.ndarray  # what the network had read, float32 [steps, in]
     output: float  # o
+    added: float  # to the initial logit: o, as a rule
     beta: float
     extrinsic_return: float
 
@@ -139,7 +140,9 @@ class Perturbed(Objective):
     def after_episode(self, played: Played) -> Lesson | None:
         before, slope = self.sequence, -self.paid(played.extrinsic_return) * self.trace
         self.sequence = played.sequence
-        self.trace += (self.perturbation / self.config.noise - self.trace) / self.config.lag
+        # Its own ξ: where several environments are played at once, the next may have another.
+        perturbed = math.copysign(1.0, played.added - played.output)
+        self.trace += (perturbed - self.trace) / self.config.lag
         self.count_episode()
         return None if before is None else Lesson([before], slope)
 

@@ -31,7 +31,7 @@ class IntrinsicReward(HasState):
 
     @abstractmethod
     def bonus(self, episode: Episode) -> Bonus:
-        """The bonus of each step, for the state it led to. Asking changes nothing."""
+        """The bonus of each step, for the state it led to. Asking again gives the same."""
 
     @abstractmethod
     def remember(self, episode: Episode, returns: np.ndarray) -> None:

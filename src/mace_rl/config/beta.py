@@ -24,7 +24,7 @@ class MetaConfig(Section):
     max_gradient_norm: PositiveFloat
     output_decay: NonNegativeFloat  # λ of λ o² / 2 in its loss
     chunks: Count  # rows at most that it reads of an episode
-    sequences: Count  # episodes at most that it learns from in one step
+    sequences: Count  # of a rollout, of which credit and evidence learn, at most
     reads: bool = True  # false: it sees a constant, whatever was played; to see what reading does
 
 

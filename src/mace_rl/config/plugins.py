@@ -11,12 +11,13 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mace_rl.base.errors import in_one_line
+from mace_rl.base.errors import Refusal, in_one_line
 from mace_rl.config.section import ConfigError, short_repr
 
 
@@ -89,13 +90,26 @@ def make(
         inspect.signature(factory).bind(*given, **arguments)
     except TypeError as error:
         raise ConfigError(f"{key} has {reference!r} with {arguments}: {error}") from None
-    try:
-        made = factory(*given, **arguments)
-    except ConfigError as error:
-        raise ConfigError(f"{key} has {reference!r}: {error}") from None
+    with noted(f"making {reference!r}"):
+        try:
+            made = factory(*given, **arguments)
+        except ConfigError as error:
+            raise ConfigError(f"{key} has {reference!r}: {error}") from None
     if not isinstance(made, kind):
         raise ConfigError(f"{key} has {reference!r}, which returned {short_repr(made)}")
     return made
+
+
+@contextmanager
+def noted(place: str) -> Iterator[None]:
+    """A context in which an error of the user's code says where it was."""
+    try:
+        yield
+    except Refusal:
+        raise
+    except Exception as error:
+        error.add_note(f"in {place}")
+        raise
 
 
 def import_module(reference: str, key: str) -> ModuleType:
@@ -107,18 +121,26 @@ def import_module(reference: str, key: str) -> ModuleType:
             raise ImportError(f"{module!r} is no module's name")
         return importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        reason = in_one_line(error)
-        raise ConfigError(f"{key} has {reference!r}, which cannot be imported: {reason}") from error
+        raise _unimportable(reference, key, error) from error
+
+
+def _unimportable(reference: str, key: str, error: BaseException) -> ConfigError:
+    return ConfigError(f"{key} has {reference!r}, which cannot be imported: {in_one_line(error)}")
 
 
 def source_files(reference: str, key: str) -> list[Path]:
-    """The Python file of a module, without importing it; in a package all there, and weights."""
+    """The Python file of a module; in a package all there, and weights.
+
+    The packages that it is in are imported, not the module itself.
+    """
     _look_here_too()
     module = reference.partition(":")[0]
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):  # the latter for __main__
         spec = None
+    except (Exception, SystemExit) as error:
+        raise _unimportable(reference, key, error) from error
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         raise ConfigError(
             f"{key} has {reference!r}, but there is no Python module {module!r}, neither installed "

@@ -8,7 +8,8 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from mace_rl.config.section import ConfigError
 
-Taken = int | np.ndarray
+# From 0; int64 [parts], from 0; or float32 [actions] before clipping to the bounds.
+Action = int | np.ndarray
 
 
 class Actions:
@@ -51,7 +52,7 @@ class Actions:
             return generator.standard_normal((steps, self.outputs))
         return generator.random((steps, len(self.parts)) if len(self.parts) else steps)
 
-    def given(self, action: Taken, clips: bool) -> Any:
+    def given(self, action: Action, clips: bool) -> Any:
         """A new value of the space; clips: Box ones to their bounds."""
         space: Any = self.space
         if self.discrete:
@@ -66,7 +67,7 @@ class Actions:
             return given if same else given.astype(space.dtype)
         return action.reshape(space.shape).astype(space.dtype)
 
-    def chosen(self, given: Any) -> Taken:
+    def chosen(self, given: Any) -> Action:
         """The other way: what a policy would have chosen; a copy."""
         space: Any = self.space
         if self.discrete:

@@ -68,7 +68,7 @@ class Environment(Spaces):
     """A Gymnasium environment with its observation size, time limit and random generator.
 
     `name` may be "package.module:Id", as in Gymnasium. Raises `ConfigError` for an unknown id, an
-    error in making or resetting it, a missing time limit and unsupported spaces.
+    error in making or resetting it, and unsupported spaces.
     """
 
     env: gymnasium.Env[Any, Any]
@@ -112,10 +112,11 @@ class Environment(Spaces):
                 f"environment {name!r} has actions {self.action_space} of integers, but a Gaussian "
                 "policy gives fractions; make them Discrete, or a Box of floats"
             )
-        if self.actions.continuous and self.max_steps * self.action_size > MOST_NOISE:
+        width = self.actions.width if not self.actions.discrete else 1
+        if self.max_steps * width > MOST_NOISE:
             raise ConfigError(
-                f"environment {name!r} has {self.action_size} numbers in an action, and its "
-                f"time limit is {self.max_steps}, not up to {MOST_NOISE // self.action_size}"
+                f"environment {name!r} has {width} numbers in an action, and its "
+                f"time limit is {self.max_steps}, not up to {MOST_NOISE // width}"
             )
         # A Bullet environment's first reset is unlike later ones: it averages over one part fewer.
         with trying_out(f"environment {name!r}"):
@@ -138,7 +139,8 @@ class Environment(Spaces):
 
     def recall(self, memory: dict[str, Any]) -> None:
         """Play on with what `memory` returned of a training, and learn no more."""
-        restore(self.env, memory)
+        if memory:  # else it is as it was at first
+            restore(self.env, memory)
         hold_still(self.env)
 
     def reset(self) -> Any:

@@ -16,12 +16,13 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from mace_rl import published
-from mace_rl.agent.policy import ActingPolicy, Action, NetworkActing
+from mace_rl.agent.policy import ActingPolicy, NetworkActing
 from mace_rl.agent.ppo import ActorCritic
 from mace_rl.agent.torch_policy import TorchPolicy
 from mace_rl.base import files
 from mace_rl.base.rng import Streams
 from mace_rl.config.run import AgentConfig
+from mace_rl.environments.actions import Action
 from mace_rl.environments.environment import LOST
 from mace_rl.numerics.normaliser import Normalisation
 from mace_rl.runs.agent_state import ENVIRONMENT
@@ -159,8 +160,6 @@ class Player:
         self.agent.load_state_dict(state)
         policy, loaded = self.networks.policy, self.agent.policy
         policy.network.load_module_state(loaded.network.state_dict())
-        if len(policy.log_std):
-            policy.log_std[:] = loaded.log_std.detach().numpy()
 
     def acting(self, deterministic: bool) -> ActingPolicy:
         """The policy for rollouts, which samples actions, or takes the most probable ones."""

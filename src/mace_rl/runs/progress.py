@@ -166,10 +166,10 @@ class Run:
         progress = read(folder / files.PROGRESS, since, Progress)
         self.progress = progress or {}
         self.seconds = math.nan  # of the whole training, if known
-        if record:
-            self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]
-        elif held(folder / files.LOCK):
+        if held(folder / files.LOCK):  # first: a finished run may go on, with more episodes
             self.state = "running"
+        elif record:
+            self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]
         else:
             self.state = "stopped" if progress else "waiting"
         if self.state == "running" and progress:

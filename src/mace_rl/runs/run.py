@@ -67,8 +67,9 @@ def run(
     aside: what is moved into a folder below `directory`: files of "others" than this run, or "all".
 
     Continues from a checkpoint of this configuration, code and versions, or of one with another
-    number of episodes; does nothing if the run is finished. Raises `RunError` if another process
-    trains in `directory` or other files are in the way, `ConfigError` if another finished run is.
+    number of episodes; does nothing if the run is finished and nothing is to be moved. Raises
+    `RunError` if another process trains in `directory` or other files are in the way, `ConfigError`
+    if another finished run is.
     """
     directory = directory.absolute()  # an environment may change the current folder
     directory.mkdir(parents=True, exist_ok=True)
@@ -180,7 +181,7 @@ def to_continue(
         for name in files.OF_A_RUN:
             for half_written in directory.glob(f".{name}.[0-9]*.tmp"):  # by a killed process
                 half_written.unlink()
-    if trained_here and not content and files.RECORD not in there:
+    if trained_here and not content and not set(there).difference(harmless):
         logger.info("starting over: what was trained in %s left no checkpoint", directory)
     if not os.fstat(lock).st_size:
         os.write(lock, CLAIM)

@@ -48,7 +48,7 @@ class UpdateRecord:
     novelty: float  # mean over the rollout's steps, like the next two
     relevance: float
     similarity: float  # of a state to what the memory holds
-    beta_credit: float  # mean credit of the βs judged in this update
+    beta_credit: float  # of the rollout whose βs this update finished judging
 
 
 RunKey = tuple[str, str, int]  # environment, variant, seed

@@ -220,7 +220,7 @@ class CuriosityTracker(Stateful):
             "observation_size": self.spaces.observation_size,
             "observation_space": repr(self.spaces.given_space),
             "environments": len(self.recordings),
-            "form": 11,  # of the state itself
+            "form": 12,  # of the state itself
         }
 
     def state_dict(self) -> dict[str, Any]:

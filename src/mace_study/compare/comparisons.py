@@ -35,19 +35,21 @@ class Comparison(NamedTuple):
     probability_high: float
 
 
-def comparisons(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+def comparisons(
+    table: pd.DataFrame, settings: MetricsConfig, together: bool = True
+) -> pd.DataFrame:
     """The data of comparisons.csv from the frame of metrics.csv.
 
     One `Comparison` per environment, metric that is compared and configured pair of variants that
-    are both there; then one per metric and pair for all environments together, if there are
-    several and all have both.
+    are both there; then, with `together`, one per metric and pair for all environments, if there
+    are several and all have both.
     """
     by_environment = {
         str(env): {str(name): own for name, own in runs.sort_values("seed").groupby("variant")}
         for env, runs in table.groupby("env", sort=False)
     }
     groups = [{env: runs} for env, runs in by_environment.items()]
-    if len(groups) > 1:
+    if together and len(groups) > 1:
         groups.append(by_environment)
     rows: list[Comparison] = []
     for environments in groups:
@@ -94,7 +96,8 @@ def _compare(
     if len(environments) > 1:
         return rows
     [environment], [(x, y)], [events] = environments, restricted, reached
-    compared = statistics.paired_comparison(x - y, *how, np.random.default_rng(seed))
+    tested = [metric.unit != "episodes" for metric in metrics]
+    compared = statistics.paired_comparison(x - y, *how, np.random.default_rng(seed), tested)
     for place, (metric, *found) in enumerate(zip(metrics, *compared, strict=True)):
         test = "sign-flip"
         if metric.unit == "episodes":

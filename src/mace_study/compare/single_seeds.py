@@ -4,8 +4,10 @@ Both metrics are read by the public code's rules (reference/worlds/protocol.md, 
 draw"). Whatever is asked is exact: over all seeds that could have been drawn.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from functools import reduce
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -57,15 +59,11 @@ def draw(runs: pd.DataFrame, table1: Table1Config) -> Draw:
     found = int(numbers(runs, table1)["unusual"].sum())
     unusual = at_least(_unusual_when_drawn(seeds) for seeds in cells.values())
     paper = {env: first_in(_paper(env, table1)) for env in table1.values}
-    led = {name: sum(leads[name].item() for leads in paper.values()) for name in table1.variants}
+    led = {name: sum(leads[name].argmax() for leads in paper.values()) for name in table1.variants}
     favoured = max(led, key=led.__getitem__)
-    first = sum(int(paper[env][favoured].item()) for env in environments)
-    firsts = []
-    for env in environments:
-        wins = first_in({name: cells[env, name] for name in table1.variants})
-        firsts.append(
-            {name: _shares(counts, len(table1.public_code)) for name, counts in wins.items()}
-        )
+    first = sum(int(paper[env][favoured].argmax()) for env in environments)
+    by_env = [{name: cells[env, name] for name in table1.variants} for env in environments]
+    firsts = [first_in(seeds) for seeds in by_env]
     favoured_first = at_least(shares[favoured] for shares in firsts)
     anyone = at_least(np.mean(list(shares.values()), axis=0) for shares in firsts)
     return Draw(
@@ -87,22 +85,29 @@ def places(values: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 
 def first_in(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """In how many columns each variant alone is lowest, of every draw of a row each.
+    """The share of all draws, a row each, in which a variant alone is lowest in 0, 1, ... columns.
 
-    cells: by variant its rows, [seeds, columns]. Returns by variant uint8 [seeds of the first,
-    seeds of the second, ...].
+    cells: by variant its rows, [seeds, columns]. Returns [columns + 1] by variant.
     """
-    count = len(cells)
-    spread = {  # [columns, 1, ..., seeds, ..., 1]: sums over the first axis are the fast ones
-        name: np.expand_dims(rows.T, [axis + 1 for axis in range(count) if axis != place])
-        for place, (name, rows) in enumerate(cells.items())
-    }
-    won: dict[str, np.ndarray] = {}
-    for name, rows in spread.items():
-        others = [other for key, other in spread.items() if key != name]
-        lowest = rows < reduce(np.minimum, others)
-        won[name] = np.asarray(np.sum(lowest, axis=0, dtype=np.uint8))
-    return won
+    draws, found = math.prod(map(len, cells.values())), {}
+    for name, rows in cells.items():
+        columns = range(rows.shape[1])
+        # By size: draws in which it is lowest in all of a set of columns, summed over the sets.
+        lowest = [0] * (len(columns) + 1)
+        for size in range(len(columns) + 1):
+            for chosen in map(list, combinations(columns, size)):
+                beaten = [
+                    (rows[:, None, chosen] < other[None][..., chosen]).all(axis=-1).sum(axis=1)
+                    for key, other in cells.items()
+                    if key != name
+                ]
+                lowest[size] += int(np.prod(beaten, axis=0).sum())
+        exactly = [  # by inclusion and exclusion
+            sum((-1) ** (size - k) * math.comb(size, k) * n for size, n in enumerate(lowest))
+            for k in range(len(lowest))
+        ]
+        found[name] = np.array(exactly) / draws
+    return found
 
 
 def at_least(shares: Iterable[np.ndarray]) -> np.ndarray:

@@ -72,7 +72,7 @@ def specification(
     for reading, moved in deviations.items():
         everything = with_learned(given, reading, str(claims))
         for whole in (True, False):
-            asked = family_of(everything, set(table["env"]), whole)
+            asked = one_way(family_of(everything, set(table["env"]), whole), how)
             for answer in ledger(table, settings, asked):
                 judged = answer.ways[how]
                 of_beta = any(part.metric in CORRELATIONS for part in judged.parts)
@@ -99,14 +99,26 @@ def in_tasks(
     rows: list[Any] = []
     given = read_yaml(Path(claims))
     for reading in readings:
-        everything = with_learned(given, reading, str(claims))
-        [answer] = ledger(table, settings, alone(everything, name))
+        asked = one_way(alone(with_learned(given, reading, str(claims)), name), how)
+        [answer] = ledger(table, settings, asked)
         judged = answer.ways[how]
         for part in judged.parts:
             found = part.seeds, part.difference, part.low, part.high, part.p_holm, part.outcome
             rows.append((name, reading, part.baseline, *found, judged.verdict))
     names = ["seeds", "difference", "low", "high", "p_holm", "outcome", "verdict"]
     return pd.DataFrame(rows, columns=["claim", "reading", "over", *names])
+
+
+def one_way(claims: ClaimsConfig, how: str) -> ClaimsConfig:
+    """The claims as they are measured in one way."""
+    families = {}
+    for title, family in claims.families.items():
+        measured = {
+            name: claim.model_copy(update={"parts": {how: claim.parts[how]}})
+            for name, claim in family.claims.items()
+        }
+        families[title] = family.model_copy(update={"claims": measured})
+    return claims.model_copy(update={"families": families})
 
 
 def alone(claims: ClaimsConfig, name: str) -> ClaimsConfig:

@@ -63,17 +63,25 @@ def interval(values: np.ndarray, settings: MetricsConfig) -> tuple[np.ndarray, n
 
 
 def paired_comparison(
-    differences: np.ndarray, confidence: float, repetitions: int, generator: np.random.Generator
+    differences: np.ndarray,
+    confidence: float,
+    repetitions: int,
+    generator: np.random.Generator,
+    tested: Sequence[bool] | None = None,
 ) -> PairedComparison:
     """Compare x with y, of which `differences` are x - y by seed, [seeds] or [seeds, metrics].
 
     The sign-flip test asks whether each sign of x - y was as likely as the other. It is exact while
-    2ⁿ ≤ `repetitions`, else of that many random sign patterns, the same for all metrics.
+    2ⁿ ≤ `repetitions`, else of that many random sign patterns, the same for all metrics. `tested`:
+    of each metric whether it is to have a p value; None for all.
     """
     mean = np.mean(differences, axis=0)
     low, high = mean_interval(differences, confidence, repetitions, generator)
     single = len(differences) == 1
-    p = np.full_like(mean, np.nan) if single else _sign_flips(differences, repetitions, generator)
+    p = np.full_like(mean, np.nan)
+    if not single:
+        chosen = ... if tested is None else (..., tested)
+        p[chosen] = _sign_flips(differences[chosen], repetitions, generator)
     return PairedComparison(mean, low, high, p)
 
 

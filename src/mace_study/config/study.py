@@ -67,6 +67,8 @@ def _listed(seeds: Any) -> Any:
     for seed in seeds if isinstance(seeds, list) else [seeds]:
         ends = re.fullmatch(SEEDS, seed, re.ASCII) if isinstance(seed, str) else None
         if not ends:
+            if isinstance(seed, str) and not seed.isdecimal():
+                raise ValueError(f"{seed!r} should be a number, or FIRST-LAST")
             listed.append(seed)
             continue
         first, last = map(int, ends.groups())

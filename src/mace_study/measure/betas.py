@@ -1,9 +1,9 @@
 """betas.csv: where β ends, its range, and whether it is larger where learning stagnates."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import scipy  # loads what is used of it when it is
 
 from mace_rl.training.records import RunKey
@@ -18,9 +18,6 @@ from mace_study.measure.metrics import (
     learning_curve,
     sample_efficiency_common,
 )
-
-if TYPE_CHECKING:  # planning the workflow imports this module
-    import pandas as pd
 
 LABELS = {  # of columns, in tables
     "beta_end": "β at the end",
@@ -38,16 +35,14 @@ def betas_columns(settings: MetricsConfig) -> dict[str, type]:
 
 
 def betas_table(
-    runs: Mapping[RunKey, "pd.DataFrame"],
+    runs: Mapping[RunKey, pd.DataFrame],
     settings: MetricsConfig,
     columns: Iterable[str] | None = None,
-) -> "pd.DataFrame":
+) -> pd.DataFrame:
     """The data of betas.csv: a row for each run, with all of its `columns` or these of `OF_BETAS`.
 
     runs: the records of each.
     """
-    import pandas as pd
-
     all_columns = list(betas_columns(settings))
     key, wanted = all_columns[:3], all_columns[3:] if columns is None else list(columns)
     rows = []

@@ -91,7 +91,8 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
     columns = ["env", "variant", "seed", "episode", shown.name]
     every = shown.zero_is_shown
     variants = {run[1] for run, frame in frames.items() if every or frame[shown.column].any()}
-    keys, episodes, averages = [], [], []
+    keys: list[tuple[Any, ...]] = []
+    episodes, averages = [], []
     shortest: dict[tuple[str, str], int] = {}
     for (environment, variant, _), frame in frames.items():
         known = shortest.get((environment, variant), len(frame))
@@ -104,12 +105,13 @@ def seed_curves(frames: Mapping[RunKey, pd.DataFrame], shown: Quantity) -> pd.Da
         stride = math.ceil(len(values) / MAX_POINTS)
         kept = np.arange(len(values) - 1, -1, -stride)[::-1]
         if variant in variants:
-            keys += [(environment, variant, seed)] * len(kept)
+            keys.append((environment, variant, seed))
             episodes.append(kept + 1)
             averages.append(average[kept])
     if not keys:
         return pd.DataFrame(columns=columns)
-    curves = pd.DataFrame(keys, columns=columns[:3])
+    rows = np.repeat(np.arange(len(keys)), list(map(len, episodes)))
+    curves = pd.DataFrame(keys, columns=columns[:3]).take(rows).reset_index(drop=True)
     return curves.assign(episode=np.concatenate(episodes), **{shown.name: np.concatenate(averages)})
 
 
@@ -123,14 +125,21 @@ def mean_curves(
     columns = ["env", "variant", "episode", "mean", "lower", "upper", "n"]
     curves = []
     for (environment, variant), runs in single_seeds.groupby(["env", "variant"], sort=False):
-        wide = runs.pivot(index="episode", columns="seed", values=shown.name)
-        values = wide.to_numpy().T  # [seeds, episodes]
+        by_seed = runs.sort_values("seed", kind="stable")
+        values = by_seed[shown.name].to_numpy().reshape(runs["seed"].nunique(), -1)
+        values = np.asfortranarray(values)  # seeds side by side: means round less
+        episodes = by_seed["episode"].to_numpy()[: values.shape[1]]
         ends = interval(values, settings)
         if shown.limits is not None:  # where the mean lies, the ends of its interval do
             ends = np.clip(ends, *reaching(shown.limits, values))
-        row = (environment, variant, wide.index, values.mean(axis=0), *ends, len(values))
+        row = (environment, variant, episodes, values.mean(axis=0), *ends, len(values))
         curves.append(pd.DataFrame(dict(zip(columns, row, strict=True))))
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
+
+
+def shows_seeds(curves: pd.DataFrame) -> bool:
+    """Whether a figure of these `mean_curves` shows single seeds somewhere."""
+    return bool((curves["n"] <= SINGLE_SEEDS).any())
 
 
 def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
@@ -141,7 +150,10 @@ def reaching(limits: tuple[float, float], values: Any) -> tuple[float, float]:
 def draw_figure(
     curves: pd.DataFrame, single_seeds: pd.DataFrame, shown: Quantity, look: PlotStyle
 ) -> Figure:
-    """A figure from `mean_curves` and `seed_curves`: one panel per environment."""
+    """A figure from `mean_curves` and `seed_curves`: one panel per environment.
+
+    single_seeds: at least those of variants with up to `SINGLE_SEEDS`, which alone are drawn.
+    """
     environments = list(curves["env"].unique())
     with style():
         names = ("Training episodes", shown.label) if environments else ("", "")
@@ -164,11 +176,12 @@ def draw_figure(
             axes.set_title(environment + (f" ({means['n'].max()} seeds)" if uneven else ""))
             draw_means(axes, means, look)
             seeds = means.groupby("variant")["n"].max()
-            for (variant, _), run in runs.groupby(["variant", "seed"], sort=False):
+            few = seeds.index[seeds.between(2, SINGLE_SEEDS)]  # the line of one is the mean's
+            lines = runs[runs["variant"].isin(few)].groupby(["variant", "seed"], sort=False)
+            for (variant, _), run in lines:
                 faint: dict[str, Any] = {"color": look.colours[variant], "linewidth": 0.5}
                 faint |= {"alpha": 0.6 / math.sqrt(seeds[variant]), "zorder": 1}
-                if 1 < seeds[variant] <= SINGLE_SEEDS:  # the line of one is the mean's
-                    axes.plot(run["episode"], run[shown.name], **faint)
+                axes.plot(run["episode"], run[shown.name], **faint)
             share = look.layout.inset
             if share and shown.limits is None and _is_early(means, share) and _is_free(axes, means):
                 inset = axes.inset_axes(INSET)
@@ -181,7 +194,7 @@ def draw_figure(
             band = f" Band: its {100 * look.confidence:g} % interval." if most >= BAND_SEEDS else ""
             line = f"Line: mean over {from_to(curves['n'])} seeds."
             explained = line + band
-            if curves["n"].min() <= SINGLE_SEEDS:
+            if curves["n"].between(2, SINGLE_SEEDS).any():
                 explained += " Faint lines: single seeds."
         if look.layout.inset and any(axes.child_axes for axes in panels):
             explained += f" Inset: the first {100 * look.layout.inset:g} %."
@@ -229,9 +242,11 @@ def save_figure(figure: Figure, *paths: str | Path) -> None:
                 unsaid = dict.fromkeys(("CreationDate", "Creator", "Producer"))
                 figure.savefig(path, dpi=DOTS_PER_INCH, metadata=unsaid)
                 continue
-            drawn = io.BytesIO()
-            figure.savefig(drawn, dpi=DOTS_PER_INCH, pil_kwargs={"compress_level": 0})
-            few_colours(Image.open(drawn)).save(path, optimize=True)
+            drawn, width = io.BytesIO(), int(figure.get_figwidth() * DOTS_PER_INCH)
+            figure.savefig(drawn, dpi=DOTS_PER_INCH, format="rgba")
+            size = width, drawn.tell() // (4 * width)
+            picture = Image.frombytes("RGBA", size, drawn.getvalue())
+            few_colours(picture).save(path, optimize=True)
 
 
 def few_colours(picture: Image.Image) -> Image.Image:
