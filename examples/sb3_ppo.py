@@ -87,10 +87,10 @@ def main() -> None:
     try:
         beta = arguments.beta if arguments.beta == "learned" else float(arguments.beta)
         CuriosityReward(gymnasium.make(arguments.environment), beta).close()
-    except ValueError:
-        parser.error(f"--beta is {arguments.beta!r}, but should be a number or learned")
     except Refusal as error:
         sys.exit(f"sb3_ppo: {error}")
+    except ValueError:
+        parser.error(f"--beta is {arguments.beta!r}, but should be a number or learned")
     torch.set_num_threads(1)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     found = np.empty((len(MEASURES), 2, len(seeds)))  # without and with curiosity

@@ -53,9 +53,7 @@ READINGS = (
     *(DEFAULT, "mace_score", "mace_progress", "mace_return", "mace_centred", "mace_words"),
     *("mace_credit_network", "mace_evidence"),
 )
-PLANTED_VARIANTS = (
-    *(*READINGS, "mace_constant_input", "mace_untrusting", "mace_credit", "mace_pretrained"),
-)
+OTHERS = ("mace_constant_input", "mace_untrusting", "mace_credit", "mace_pretrained")
 DECIDES = "robust"
 
 
@@ -153,7 +151,7 @@ def in_planted(kept: Path) -> pd.DataFrame:
     rows = []
     for problem, kinds in PLANTED.items():
         there = kept_runs.read(kept / "planted" / f"Planted{problem}-v0.parquet")
-        variants = [name for name in PLANTED_VARIANTS if (name, HELD_OUT[0]) in there]
+        variants = [name for name in (*READINGS, *OTHERS) if (name, HELD_OUT[0]) in there]
         for (first, kind), variant in product(enumerate(kinds), variants):
             runs = [there[variant, seed] for seed in HELD_OUT]
             ends = np.array([end_of_beta(run, first, len(kinds)) for run in runs])

@@ -144,7 +144,8 @@ def test_an_error_in_an_environment_says_where(register, monkeypatch, tmp_path, 
     code, said = call(monkeypatch, *words)
     assert code == 1 and "\n" not in said
     assert f"mace-rl: in {name} ppo seed 0, episode 3, in " in said
-    assert ("step 2 of an episode" if where == "step" else "a reset of") in said
+    what = "step 2 of an episode" if where == "step" else "a reset"
+    assert f", in {what} of {name}: " in said
     assert type(error).__name__ in said
     file = said.rpartition("(traceback: ")[2].rstrip(")")
     with open(file, encoding="utf-8") as kept:

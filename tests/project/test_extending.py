@@ -181,6 +181,7 @@ def test_help_and_mistakes(monkeypatch, capsys):
         expected = f"{option} is {value}, but should be at least {least}"
         assert refused(option, str(value)).endswith(expected)
     assert refused("--beta", "x").endswith("--beta is 'x', but should be a number or learned")
+    assert "beta.value is 20.0, but should be less" in refused("--beta", "20")
     for name in ("Foo", "CartPole-v9", "nope:Foo-v0"):
         line = refused("--environment", name)
         assert line.startswith(f"sb3_ppo: --environment {name!r} cannot be made: ")

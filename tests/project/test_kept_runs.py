@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from invented import episode_columns
-from shared import refusal, refused
+from shared import content_of, refusal, refused
 
 from mace_rl.base import files
 from mace_rl.library import settings
@@ -34,11 +34,6 @@ def make_run(folder: Path, number: int, episodes: int = 30, **others: np.ndarray
     (folder / files.RECORD).write_text(json.dumps(record))
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    found = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(found)}
-
-
 def test_what_was_packed_comes_out(tmp_path: Path) -> None:
     """But for `intrinsic_return`; compared with what pandas reads of the run's own file."""
     results, kept = tmp_path / "results", tmp_path / "kept"
@@ -47,7 +42,7 @@ def test_what_was_packed_comes_out(tmp_path: Path) -> None:
         make_run(results / "runs" / run, number, episodes=1000 + 7 * number)
     (results / "runs/A-v1/ppo/seed11").mkdir()  # not finished
     assert kept_runs.pack(results, kept) == 4
-    assert sorted(content(kept)) == ["A-v1.parquet", "B-v0.parquet"]
+    assert sorted(content_of(kept)) == ["A-v1.parquet", "B-v0.parquet"]
     found = {
         (path.stem, *key): run
         for path in kept.glob("*.parquet")
@@ -94,14 +89,14 @@ def test_packing_again_adds_and_equal_runs_give_equal_files(tmp_path: Path) -> N
     kept_runs.pack(tmp_path / "half1", tmp_path / "kept")
     assert kept_runs.pack(tmp_path / "half0", tmp_path / "kept") == 2
     kept_runs.pack(tmp_path / "whole", tmp_path / "kept whole")
-    assert content(tmp_path / "kept") == content(tmp_path / "kept whole")
+    assert content_of(tmp_path / "kept") == content_of(tmp_path / "kept whole")
 
 
 def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_path: Path) -> None:
     run, kept = tmp_path / "results/runs/A-v1/ppo/seed100", tmp_path / "kept"
     make_run(run, 1)
     kept_runs.pack(tmp_path / "results", kept)
-    before = content(kept)
+    before = content_of(kept)
     shutil.rmtree(run)
     make_run(run, 2)
     with pytest.raises(ValueError, match=r"A-v1\.parquet has another run of this seed"):
@@ -110,7 +105,7 @@ def test_records_that_are_not_the_runs_and_other_runs_of_a_seed_are_refused(tmp_
     (run / files.EPISODES).write_text(text.replace("0", "1"))
     with pytest.raises(ValueError, match=r"episodes\.csv: "):
         kept_runs.pack(tmp_path / "results", tmp_path / "new")
-    assert content(kept) == before and not (tmp_path / "new").exists()
+    assert content_of(kept) == before and not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

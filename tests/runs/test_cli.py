@@ -16,12 +16,11 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from shared import GOOD, RESULTS, Bonanza, call, files, refusal
+from shared import GOOD, RESULTS, call, files, refusal
 
 from mace_rl import __main__, cli
 from mace_rl.config.reading import DEFAULTS
 from mace_rl.config.section import ConfigError
-from mace_rl.runs import run
 from mace_study.config.study import load_study
 
 CONFIG = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
@@ -133,14 +132,6 @@ def test_a_run_by_hand_then_as_another_then_again(monkeypatch, tmp_path, caplog)
     assert call(monkeypatch, *command) == (0, "")
     assert "finished" in caplog.text
     assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
-
-
-def test_an_exception_of_an_environment_says_when_it_was(register, run_config, tmp_path):
-    name = register("Bonanza-v0", Bonanza, 5, where="reward", value="text")  # 1 + "text"
-    with pytest.raises(TypeError) as caught:
-        run.run(run_config(name, "ppo", 3, episodes=9), tmp_path)
-    notes = ["in step 3 of an episode of Bonanza-v0", "in Bonanza-v0 ppo seed 3, episode 4"]
-    assert caught.value.__notes__ == notes
 
 
 @pytest.mark.parametrize("command", [["status", "."], [*TRAIN, "--out", "x"]])
