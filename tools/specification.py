@@ -57,15 +57,16 @@ OTHERS = ("mace_constant_input", "mace_untrusting", "mace_credit", "mace_pretrai
 DECIDES = "robust"
 
 
+def asked_by(run: kept_runs.Kept) -> np.ndarray:
+    """The β that is asked for in each episode of a run, [E]."""
+    config = RunConfig.model_validate(json.loads(run.record)["config"])
+    return asked_beta(run.episodes["beta"].to_numpy(), config)
+
+
 def end_of_beta(run: kept_runs.Kept, first: int = 0, step: int = 1) -> float:
-    """The mean β that is asked for in the last tenth of a run, in each `step`-th episode of it."""
-    asked = asked_beta(run.episodes["beta"].to_numpy(), config_of(run))
+    """Its mean over the last tenth of a run, or over each `step`-th episode of that."""
+    asked = asked_by(run)
     return float(asked[-(len(asked) // 10) :][first::step].mean())
-
-
-def config_of(run: kept_runs.Kept) -> RunConfig:
-    """The settings of a run."""
-    return RunConfig.model_validate(json.loads(run.record)["config"])
 
 
 class Measured(NamedTuple):
@@ -77,28 +78,16 @@ class Measured(NamedTuple):
 
 
 def measured(
-    folder: Path,
-    run: tuple[str, str],
-    seeds: range,
+    cell: tuple[str, str],
+    runs: Mapping[int, kept_runs.Kept],
     settings: MetricsConfig,
     columns: Collection[str],
-) -> Measured | None:
-    """The runs of an environment and variant; None where some are lacking.
-
-    columns: of metrics.csv and betas.csv.
-    """
-    environment, variant = run
-    there = kept_runs.read(folder / f"{files.folder_of(environment)}.parquet", [variant])
-    if not {(variant, seed) for seed in seeds} <= {*there}:
-        return None
-    frames, moved, first = {}, [], {}
-    for seed in seeds:
-        frame = there[variant, seed].episodes
-        frames[environment, variant, seed] = frame
-        first[seed] = float(frame["extrinsic_return"][: ceiling.LAST].mean())
-        if variant in READINGS:
-            config = config_of(there[variant, seed])
-            moved.append(float(asked_beta(frame["beta"].to_numpy(), config).std()))
+) -> Measured:
+    """The runs of an environment and variant, by seed; columns: of metrics.csv and betas.csv."""
+    frames = {(*cell, seed): run.episodes for seed, run in runs.items()}
+    returns = {seed: run.episodes["extrinsic_return"] for seed, run in runs.items()}
+    first = {seed: float(own[: ceiling.LAST].mean()) for seed, own in returns.items()}
+    moved = [float(asked_by(run).std()) for run in runs.values() if cell[1] in READINGS]
     metrics = [metric for metric in all_metrics(settings) if metric.name in columns]
     rows = metrics_table(frames, settings, metrics)
     if of_betas := [name for name in OF_BETAS if name in columns]:
@@ -117,10 +106,14 @@ def asked(
 
     columns: as of `measured`.
     """
-    jobs = [(env, name) for name in (*baselines, *READINGS) for env in seeds]
-    made = [measured(folder, job, seeds[job[0]], settings, columns) for job in jobs]
-    found = {job: runs for job, runs in zip(jobs, made, strict=True) if runs}
-    whole = [name for _, name in jobs if all((env, name) in found for env in seeds)]
+    found = {}
+    for name, env in product((*baselines, *READINGS), seeds):
+        there = kept_runs.read(folder / f"{files.folder_of(env)}.parquet", [name])
+        runs = {seed: there[name, seed] for seed in seeds[env] if (name, seed) in there}
+        if len(runs) == len(seeds[env]):
+            found[env, name] = measured((env, name), runs, settings, columns)
+    names = {name for _, name in found}
+    whole = [name for name in names if all((env, name) in found for env in seeds)]
     if lacking := [name for name in baselines if name not in whole]:
         raise Refusal(f"{folder} lacks runs of {', '.join(lacking)}")
     return {job: runs for job, runs in found.items() if job[1] in whole}
@@ -196,7 +189,7 @@ def make(kept: Path, goal: Path) -> list[str]:
         "planted": in_planted(kept),
         "gains": ceiling.gains(forks, metrics),
         "effects": ceiling.effects(forks, metrics),
-        "ceiling": pd.concat([of_oracle(forks, metrics), *earned], ignore_index=True),
+        "ceiling": pd.concat([ceiling.of_oracle(forks, metrics), *earned], ignore_index=True),
     }
     answers = tables["specification"]
     shown = [name for name in READINGS if name in set(answers["reading"])]
@@ -214,20 +207,6 @@ def make(kept: Path, goal: Path) -> list[str]:
         save_figure(picture, goal / f"{name}.png")
     (goal / "README.md").write_text(page("readings", ORIGIN, told, [*pictures]), encoding="utf-8")
     return [*(f"{name}.csv" for name in tables), *(f"{name}.png" for name in pictures), "README.md"]
-
-
-def of_oracle(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
-    """What the oracle and β = 0.4 earn over PPO with the seeds of the ceiling, as `over_ppo`."""
-    found = []
-    for (world, horizon), forks in rows.groupby(["world", "episodes"], sort=False):
-        named = forks.assign(who=forks["who"].replace("oracle", f"oracle, H = {horizon}"))
-        single = named.drop_duplicates(["env", "who", "seed"])
-        means = {
-            (str(env), str(who)): dict(zip(each["seed"], each["mean_return"], strict=True))
-            for (env, who), each in single.groupby(["env", "who"], sort=False)
-        }
-        found.append(ceiling.over_ppo(means, settings).assign(world=str(world)))
-    return pd.concat(found).drop_duplicates(["world", "env", "variant"])
 
 
 def of_ceiling(gains: pd.DataFrame, effects: pd.DataFrame) -> list[Section]:

@@ -86,3 +86,17 @@ def over_ppo(
             compared = paired_comparison(np.array(difference) / everything, *how, generator)
             found.append((env, variant, len(difference), *map(float, compared[:3])))
     return pd.DataFrame(found, columns=["env", "variant", "seeds", "gain", "low", "high"])
+
+
+def of_oracle(rows: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
+    """What the oracle and β = 0.4 earn over PPO, as `over_ppo` says it, with the column world."""
+    found = []
+    for (world, horizon), forks in rows.groupby(["world", "episodes"], sort=False):
+        named = forks.assign(who=forks["who"].replace(ORACLE, f"{ORACLE}, H = {horizon}"))
+        single = named.drop_duplicates(["env", "who", "seed"])
+        means = {
+            (str(env), str(who)): dict(zip(each["seed"], each["mean_return"], strict=True))
+            for (env, who), each in single.groupby(["env", "who"], sort=False)
+        }
+        found.append(over_ppo(means, settings).assign(world=str(world)))
+    return pd.concat(found).drop_duplicates(["world", "env", "variant"])
