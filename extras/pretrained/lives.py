@@ -29,6 +29,7 @@ Choice = Callable[[Gauge], float]  # β after a window
 class Branch:
     """A point of a life: what was seen so far, and what was still earned under each β of `GRID`."""
 
+    task: int
     seen: list[list[float]]  # the features of each window
     earned: list[float]  # per episode of the whole budget, in units of solving the task
 
@@ -120,7 +121,7 @@ def branches(number: int, seed: int, choose: Choice | None, count: int = 2) -> l
             gauge = trainer.controller.gauge
             if points and len(gauge.windows) >= points[0]:
                 points.pop(0)
-                found.append(Branch([*gauge.windows], futures(config, trainer)))
+                found.append(Branch(number, [*gauge.windows], futures(config, trainer)))
             if not points:
                 return found
     return found

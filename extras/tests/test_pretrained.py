@@ -168,9 +168,9 @@ def test_what_a_beta_earns_is_interpolated_between_those_that_were_tried():
 def test_lives_are_kept_and_a_torn_one_is_cut_off(tmp_path):
     path = tmp_path / "weights.jsonl"
     assert read_lives(path) == []
-    whole = '[{"seen": [[0.5]], "earned": [0.1, 0.2, 0.3]}]\n[]\n'
-    path.write_text(whole + '[{"se')
-    assert read_lives(path) == [[Branch([[0.5]], [0.1, 0.2, 0.3])], []]
+    whole = '[{"task": 7, "seen": [[0.5]], "earned": [0.1, 0.2, 0.3]}]\n[]\n'
+    path.write_text(whole + '[{"task": 8, "se')
+    assert read_lives(path) == [[Branch(7, [[0.5]], [0.1, 0.2, 0.3])], []]
     assert path.read_text() == whole
 
 

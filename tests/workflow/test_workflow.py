@@ -52,8 +52,9 @@ class Project:
         for name in code_digest.KERNELS:
             here, there = (place(str(top / name / "x")) for top in (code_digest.PACKAGE, package))
             goal = package / "__pycache__" / "numba" / compiling.FOLDER.name / there
-            unfinished = shutil.ignore_patterns("*.tmp.*")
-            shutil.copytree(compiling.FOLDER / here, goal, ignore=unfinished)
+            if (compiling.FOLDER / here).exists():
+                unfinished = shutil.ignore_patterns("*.tmp.*", "tmp*")
+                shutil.copytree(compiling.FOLDER / here, goal, ignore=unfinished)
 
     def __getitem__(self, name: str) -> Path:
         return self.folder / name

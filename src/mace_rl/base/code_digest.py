@@ -53,11 +53,12 @@ def meaning(file: Path) -> bytes:
     return ast.dump(tree).encode()
 
 
+@cache  # the code in this process is what it was when it was imported
 def _lines(part: str) -> list[str]:
     return [_own_line(file) for file in files(part)]
 
 
-@cache  # the code in this process is what it was when it was imported
+@cache  # both parts have it
 def _own_line(file: Path) -> str:
     return _line(file, meaning(file))
 

@@ -139,8 +139,7 @@ class Environment(Spaces):
 
     def recall(self, memory: dict[str, Any]) -> None:
         """Play on with what `memory` returned of a training, and learn no more."""
-        if memory:  # else it is as it was at first
-            restore(self.env, memory)
+        restore(self.env, memory)
         hold_still(self.env)
 
     def reset(self) -> Any:

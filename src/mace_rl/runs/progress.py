@@ -166,7 +166,7 @@ class Run:
         progress = read(folder / files.PROGRESS, since, Progress)
         self.progress = progress or {}
         self.seconds = math.nan  # of the whole training, if known
-        if held(folder / files.LOCK):  # first: a finished run may go on, with more episodes
+        if (progress or not record) and held(folder / files.LOCK):  # a finished run may go on
             self.state = "running"
         elif record:
             self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]

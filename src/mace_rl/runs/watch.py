@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mace_rl.config.section import ConfigError
 from mace_rl.environments.environment import Environment, nothing_printed
+from mace_rl.environments.remembered import hold_still
 from mace_rl.runs.agent import Player
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.training.resuming import seeded
@@ -139,7 +140,10 @@ def film(
     except ConfigError as error:  # it trains, so it does not take this mode
         raise RenderError(f"{error}, so it cannot be drawn") from None
     environment.clips_actions = config.ppo.clip_actions
-    environment.recall(player.memory)
+    if untrained:
+        hold_still(environment.env)
+    else:
+        environment.recall(player.memory)
     filmed = environment.env = Filmed(environment.env, config.environment, width, seconds)
     generator = np.random.default_rng(seed)
     with closing(filmed), nothing_printed(), seeded(globally):
