@@ -332,7 +332,7 @@ def test_another_config_yaml_where_snakemake_starts_is_not_read(finished: Projec
 
 def test_the_same_command_after_it_was_interrupted_killed_and_ended(finished: Project) -> None:
     place, said = "runs/Acrobot-v1/mace_full/seed0", "environments=[Acrobot-v1]"
-    said += " variants=[mace_full] 'training={episodes: 300}' results="
+    said += " variants=[mace_full] 'training={episodes: 3000}' results="
     command = f"snakemake killed/metrics.csv --config {said}killed"
     whole = f"snakemake whole/{place}/run.json --config {said}whole"
     run = finished["killed"] / place
