@@ -138,6 +138,22 @@ USERS |= {"axes.formatter.use_locale": True, "path.simplify": False, "pdf.compre
 USERS |= {"axes.prop_cycle": matplotlib.cycler(color="r"), "axes.grid": True}
 
 
+@pytest.mark.parametrize(("seeds", "drawn"), [(1, 0), (2, 2), (10, 10), (11, 0)])
+def test_single_seeds_are_drawn_and_told_if_there_are_two_to_ten(seeds, drawn, tmp_path):
+    """With more they are not even needed."""
+    figure = draw(seeds=seeds, episodes=12)
+    assert [len(axes.lines) for axes in figure.axes] == [2 + 2 * drawn] * 2
+    assert ("Faint lines" in figure.legends[0].get_title().get_text()) == bool(drawn)
+    means, single = data(seeds=seeds, episodes=12)
+    assert c.shows_seeds(means) == (seeds <= 10)
+    if seeds > 10:
+        look = c.PlotStyle(FigureConfig(columns=3), 0.95, LABELS, COLOURS, {})
+        without = c.draw_figure(means, single.iloc[:0], RETURN, look)
+        for name, each in {"with": figure, "without": without}.items():
+            c.save_figure(each, tmp_path / f"{name}.png")
+        assert (tmp_path / "with.png").read_bytes() == (tmp_path / "without.png").read_bytes()
+
+
 def test_labels_are_plain_text(monkeypatch):
     for label in ("$$", r"$\notacommand{$", r"$\lambda$ & <50 %> #~^{}", "long " * 12):
         monkeypatch.setitem(LABELS, "ppo", label)

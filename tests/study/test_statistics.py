@@ -78,6 +78,15 @@ def test_paired_comparison_against_scipy_and_enumeration():
     assert one.difference == 16 and np.isnan(one[1:]).all()
 
 
+@pytest.mark.parametrize("seeds", [6, 20])  # by all sign patterns, and by random ones
+def test_a_metric_that_is_not_tested_changes_no_other(seeds):
+    differences = generator(1).normal(0.3, 1, (seeds, 3))
+    every = s.paired_comparison(differences, *HOW, generator())
+    some = s.paired_comparison(differences, *HOW, generator(), [True, False, True])
+    expected = every._replace(p_value=np.where([1, 0, 1], every.p_value, np.nan))
+    np.testing.assert_equal(some, expected)
+
+
 def test_a_tie_is_one_whatever_rounding_makes_of_it():
     """Many sign patterns of whole numbers have the same small sum, in any unit."""
     whole = np.array([-40, 24, -4, -25, 14, -17, -25, -37, 10, -12, 13, 33, 4, 7, -39, 16, 9, 70])
@@ -229,6 +238,7 @@ def test_comparisons_of_pairs():
     assert "sample_efficiency_public_code" not in set(result["metric"])
     together = result[result["env"] == "all"]
     result = result.drop(together.index)
+    assert comparisons(shuffled, QUICK, together=False).equals(result)
     for row in result.itertuples():
         runs = frame[frame["env"] == row.env].set_index("variant")[row.metric]
         x, y = (runs[name].to_numpy(float) for name in (row.variant, row.baseline))
