@@ -63,7 +63,7 @@ cross-cpu: setup ## train under emulated processors and compare to the bit (half
 	@$(PYTEST) -v -m emulated
 
 kill-test: setup ## kill trainings at bad moments and compare to the bit (minutes)
-	@$(IN_VENV) pytest -v -m kill
+	@$(PYTEST) -v -m kill
 
 slurm-test: setup ## the reduced study on a Slurm cluster of one node, compared to the bit (minutes)
 	@$(IN_VENV) pytest -sv -m slurm

@@ -3,12 +3,12 @@
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Discrete
 from pydantic import Field, PositiveFloat
 
 from extras.prediction_error import PredictionError, PredictorSettings
 from mace_rl.agent.distribution import log_prob_gradient
-from mace_rl.config.section import Units, check
+from mace_rl.config.section import ConfigError, Units, check
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 from mace_rl.numerics.matmul import dot
@@ -30,18 +30,21 @@ class ICM(PredictionError):
 
     - the inverse model says from φ(s) and φ(s') which action led from one to the other, so that φ
       need not hold what no action can influence. L_I (equation 3) is the negative log-probability
-      of the action: softmax for Discrete ones, Gaussian with standard deviation 1 for vectors;
+      of the action: softmax for Discrete ones, Gaussian with standard deviation 1 for Box;
     - the forward model says from φ(s) and the action what φ(s') is. L_F (equation 5) is half the
       squared error.
 
     All are trained together on (1 - `forward_weight`) L_I + `forward_weight` L_F (equation 7,
     without the policy's term, which is PPO's here).
 
-    Raises `ConfigError` for arguments that are not as `Settings` has them.
+    Raises `ConfigError` for arguments that are not as `Settings` has them, and for actions that are
+    several choices at once.
     """
 
     def __init__(self, spaces: Spaces, generator: np.random.Generator, **arguments: Any) -> None:
         settings = check(Settings, arguments, "arguments")
+        if not isinstance(spaces.action_space, Discrete | Box):
+            raise ConfigError(f"it is for Discrete and Box actions, not {spaces.action_space}")
 
         def new(inputs: int, outputs: int) -> CompiledMLP:
             return CompiledMLP(mlp([inputs, settings.hidden_units, outputs], 1.0, generator))
@@ -71,7 +74,7 @@ class ICM(PredictionError):
         else:
             actions = episode.actions.astype(np.float32)
             if self.spaces.clips_actions:
-                actions = actions.clip(space.low, space.high).astype(np.float32)
+                actions = actions.clip(space.low.ravel(), space.high.ravel()).astype(np.float32)
         return np.concatenate([seen[:-1], seen[1:], actions], axis=1)
 
     def errors(self, inputs: np.ndarray) -> np.ndarray:

@@ -283,7 +283,7 @@ def sections(answers: pd.DataFrame, betas: pd.DataFrame) -> list[Section]:
         frame = order.merge(wide).merge(same, "left", left_on="claim", right_index=True).fillna("")
         frame = frame.sort_values("claim", key=lambda names: names.str[1:].astype(int))
         note = (
-            f"†: the claim is about Hopper, too, where at most {DEFAULT} has runs; asked of the"
+            "†: the claim is about Hopper, too, where not all readings have runs; asked of the"
             f" other environments, and not counted. *As the default*: readings with {DEFAULT}'s"
             " answer, of all."
         )

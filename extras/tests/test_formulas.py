@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from shared import Twin
 from torch.nn.functional import cross_entropy
 
@@ -12,10 +12,12 @@ from extras.hashing import HashCounts
 from extras.icm import ICM
 from extras.random_beta import RandomBeta
 from extras.rnd import RND
+from mace_rl.config.section import ConfigError
 from mace_rl.environments.episode import Episode
 from mace_rl.environments.spaces import Spaces
 
-ACTIONS = {"discrete": Discrete(3), "box": Box(-1, 1, (2,), np.float32)}
+ACTIONS = {"discrete": Discrete(3)}
+ACTIONS |= {f"{len(shape)}d": Box(-1, 1, shape, np.float32) for shape in ((2,), (2, 1))}
 ARMS = [0.0, 0.1, 0.4, 1.0]
 
 
@@ -54,6 +56,12 @@ def test_rnd_by_autograd():
     np.testing.assert_allclose(rnd.bonus(episode).reward, errors.detach(), rtol=1e-3, atol=1e-5)
     found, expected = rnd.gradient(seen.astype(np.float32)), predictor.gradient(errors.mean())
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_icm_refuses_several_choices_at_once():
+    spaces = Spaces("a test's", Box(-9, 9, (5,)), MultiDiscrete([2, 3]))
+    with pytest.raises(ConfigError, match="Discrete and Box actions, not MultiDiscrete"):
+        ICM(spaces, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("actions", ACTIONS)

@@ -34,6 +34,7 @@ MONITORS = "*monitor.csv"
 # What columns are called, the first that is there: by Monitor, by `mace-rl export`, by others.
 RETURN = ("r", "return", "extrinsic_return", "episode_return", "episodic_return", "episode_reward")
 LENGTH = ("l", "length", "episode_length", "episodic_length")
+RUN = ("folder", "task", "algorithm", "seed")  # by which `mace-rl export` tells runs apart
 PARTS = {"beta": "β", "intrinsic_return": "bonus"}  # that a run may have, by their columns
 WRITTEN: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
 
@@ -41,7 +42,7 @@ WRITTEN: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_f
 class Row(NamedTuple):
     """One episode."""
 
-    ended: float  # when, s; of one file only the order counts
+    ended: float  # when, s; 0 where the file does not say
     extrinsic_return: float
     length: int
     parts: dict[str, float]  # of `PARTS`, those that the file has
@@ -51,7 +52,7 @@ def read(path: Path, returns: str | None = None, lengths: str | None = None) -> 
     """The episodes of a file, or of the Monitors' files in a folder; seconds are from its start.
 
     returns, lengths: the names of these columns; None: one of `RETURN`, of `LENGTH`. Where there is
-    no length an episode counts as one step. `RecordError` names file and line.
+    no length an episode counts as one step. `RecordError` names file and line, also of another run.
     """
     if not path.is_dir():
         return _read(path, returns, lengths)[1]
@@ -77,12 +78,16 @@ def _read(path: Path, returns: str | None, lengths: str | None) -> tuple[float, 
     length = _column(path, names, "length", lengths, LENGTH) if lengths else None
     length = length or next((name for name in LENGTH if name in names), None)
     parts = [name for name in PARTS if name in names]
-    rows = []
+    rows: list[Row] = []
+    run: dict[str, str] = {}
     try:
-        for place, line in enumerate(lines):
+        for line in lines:
+            for name in set(RUN).intersection(names):
+                if run.setdefault(name, line[name]) != line[name]:
+                    raise ValueError(f"{name} is {line[name]!r} after {run[name]!r}: another run")
             rows.append(
                 Row(
-                    ended=_number(line, "t") if "t" in names else float(place),
+                    ended=_number(line, "t") if "t" in names else 0.0,
                     extrinsic_return=_number(line, column),
                     length=_whole(line, length) if length else 1,
                     parts={name: _number(line, name) for name in parts},

@@ -13,7 +13,7 @@ from typing import Any
 from mace_rl.base import files
 from mace_rl.environments import spec_of
 from mace_rl.runs.provenance import read_record
-from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, read_claims, too_few
+from mace_study.compare.claims_config import ClaimsConfig, read_claims, undecided
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import Study
 from mace_study.measure.metrics import all_metrics, metric_units, out_of_reach
@@ -192,7 +192,7 @@ class Plan:
                 lines.append(
                     f"of {self.claims}, {title} are not judged: the study lacks {lacking[0]}"
                 )
-        seeds = (study.environment_seeds.get(env, study.seeds) for env in study.environments)
-        if self.judged and (fewest := min(map(len, seeds))) < FEWEST_SEEDS:
-            lines.append(f"no claim can have a verdict: {too_few(fewest)}")
+        seeds = [study.environment_seeds.get(env, study.seeds) for env in study.environments]
+        if self.judged and (lacking := undecided([*map(len, seeds)])):
+            lines.append(lacking)
         return lines

@@ -96,7 +96,7 @@ def judge(
 ) -> None:
     """The ledger: what of the paper holds, and what of our own questions (docs/metrics.md).
 
-    seconds: that all runs took; command: that makes them.
+    seconds: that all runs took, 0 if unknown; command: that makes them.
     """
     data = sections.read_data(folder, ["metrics", "betas"], runs, settings)
     keys = ["env", "variant", "seed"]
@@ -104,7 +104,8 @@ def judge(
     answers, hours = verdicts.ledger(table, settings, paper), seconds / 3600
     cost = {"command": command, "runs": len(table), "core_hours": hours}
     write_atomically(folder / "claims.json", ledger.to_json(cost, answers))
-    origin = f"`{command}`: {len(table)} runs, {hours:.1f} core-hours."
+    took = f", {hours:.1f} core-hours" if seconds else ""  # unknown of imported runs
+    origin = f"`{command}`: {len(table)} runs{took}."
     page = markdown.page("Does it hold?", origin, sections.of_ledger(answers, paper))
     write_atomically(folder / "claims.md", page)
 

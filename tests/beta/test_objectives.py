@@ -53,6 +53,14 @@ def test_return_by_autograd(centred, level):
         assert all(np.sign(found[1:]) == -np.sign(level))
 
 
+@pytest.mark.parametrize("value", [0.99, -0.006, -200.0])  # means of the first two are rounded
+def test_where_all_returns_are_equal_they_say_nothing(value):
+    centred = Return(ReturnObjective(kind="return", centred=True, recent=100))
+    config = ScoreObjective(kind="score", window=3, noise=1.5, lag=2.0, recent=100)
+    for objective in (centred, Score(config, np.random.default_rng(0))):
+        assert not np.nan_to_num(slopes(objective, [value] * 150)).any()
+
+
 def test_perturbations_come_in_pairs_of_windows():
     config = ScoreObjective(kind="score", window=3, noise=1.5, lag=2.0, recent=9)
     score, found = Score(config, np.random.default_rng(0)), []

@@ -85,10 +85,12 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path, monkeypatch,
     metrics = (kept / "metrics.csv").read_bytes()
     (kept / "metrics.csv").write_bytes(metrics + b"\n")
     (kept / "README.md").unlink()
-    named = "tables: not those that are kept: "
-    named += "reference/tables/small/metrics.csv, reference/tables/small/README.md"
+    (kept / "claims.json").touch()
+    named = "tables: not those that are kept: reference/tables/small/metrics.csv, "
+    named += "reference/tables/small/README.md, reference/tables/small/claims.json, no longer made"
     assert tabulate("--check") == (made, named)
     (kept / "metrics.csv").write_bytes(metrics)
+    (kept / "claims.json").unlink()
     (kept / "README.md").write_text("stale")
     assert tabulate() == ("renewed: reference/tables/small/README.md\n" + made, "")
     assert (kept / "README.md").read_text() == readme

@@ -185,11 +185,16 @@ def test_a_state_that_would_not_be_read_again_is_named(run_config, register, tmp
 
 
 @pytest.mark.parametrize("said", ["often", "-1", "nan", ""])
-def test_a_time_between_checkpoints_that_cannot_be(run_config, tmp_path, monkeypatch, said):
-    monkeypatch.setenv("MACE_RL_CHECKPOINT_SECONDS", said)
+def test_a_time_between_checkpoints_that_cannot_be(
+    trained, run_config, tmp_path, monkeypatch, said
+):
     refusal = f"MACE_RL_CHECKPOINT_SECONDS is {said!r}, but should be a number of seconds"
+    shutil.copytree(trained("CartPole-v1", "ppo", episodes=2), tmp_path / "run")
+    monkeypatch.setenv("MACE_RL_CHECKPOINT_SECONDS", said)
+    before = content_of(tmp_path / "run")
     with pytest.raises(run.RunError, match=re.escape(refusal)):
-        run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path)
+        run.run(run_config("CartPole-v1", "ppo", 0, episodes=2), tmp_path / "run", aside="all")
+    assert content_of(tmp_path / "run") == before  # nothing was moved
 
 
 @pytest.mark.parametrize(("cost", "wait"), [(0.01, 10.0), (0.1, 10.0), (0.5, 50.0), (3.0, 300.0)])

@@ -148,6 +148,15 @@ def test_events_of_a_run_that_is_not_finished(run_config, monkeypatch, tmp_path)
         assert len(returns) == len(found["updates/entropy"]) == count
 
 
+def test_events_of_a_finished_run_that_goes_on(run, run_config, monkeypatch, tmp_path):
+    trainer = Trainer(run_config(variant="mace_full", episodes=9))
+    for _ in zip(range(5), trainer.run(), strict=False):
+        pass
+    checkpoint.save(run / files.CHECKPOINT, {}, {"trainer": trainer.state_dict()})
+    assert call(monkeypatch, "tensorboard", str(run)) == (0, "")
+    assert len(scalars(run / files.EVENTS)["episodes/extrinsic_return"]) == 5
+
+
 UNEVEN = {"episode": torch.arange(2), "beta": torch.zeros(3)}
 COMPLEX = {"episode": torch.tensor([1]), "beta": torch.tensor([1j])}
 NO_TRAINERS = [3, {"records": {"episode": 3}}]

@@ -228,7 +228,7 @@ def test_what_cannot_go_on_is_refused_with_the_reason(run_config, tmp_path):
     before = {folder: content_of(tmp_path / folder) for folder in ("without", "other", "budget")}
     for folder, episodes, changes, why in (
         ("without", 4, {}, "config.episodes was 3 and is 4, without a checkpoint to go on from"),
-        ("other", 4, {"ppo": {"clip": 0.1}}, "config.episodes was 3 and is 4"),
+        ("other", 4, {"ppo": {"clip": 0.1}}, "config.ppo.clip was 0.2 and is 0.1"),
         ("budget", 4, by_budget, f"is 4, which beta.rule {RULE!r} needs to know"),
     ):
         with refused(ConfigError, rf"{folder} holds a finished run where .*{re.escape(why)}"):

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from shared import ENVIRONMENTS, OUTCOME, RESULTS, VARIANTS, provenance_of
@@ -31,6 +30,7 @@ OFTEN = os.environ | {"MACE_RL_CHECKPOINT_SECONDS": "0.05"}
 TRAIN = "import mace_rl.runs.run as r; r.CHECKPOINT_COST = 1.0; "
 TRAIN += "from mace_rl.cli import main; main()"
 ATTEMPTS = 3  # to hit a moment
+LOOK = 0.0005  # seconds between looks for it: writing a file takes longer
 
 
 def start(environment: str, variant: str, folder: Path) -> subprocess.Popen[bytes]:
@@ -63,7 +63,12 @@ def writing_results(folder: Path) -> bool:
     return some or any(name.startswith(half) for name in found)
 
 
-MOMENTS = {"training": begun, "checkpoint": writing_checkpoint, "results": writing_results}
+def training(folder: Path) -> bool:
+    """From the end of its first episodes on, before which it may compile for many seconds."""
+    return files.PROGRESS in names(folder)
+
+
+MOMENTS = {"training": training, "checkpoint": writing_checkpoint, "results": writing_results}
 
 
 def kill_at(
@@ -76,36 +81,32 @@ def kill_at(
             process.kill()
             process.communicate()
             return process.returncode == -signal.SIGKILL
+        time.sleep(LOOK)
     return False
 
 
-@pytest.fixture(scope="module", params=[*product(ENVIRONMENTS, VARIANTS)], ids="-".join)
-def undisturbed(request: pytest.FixtureRequest, tmp_path_factory) -> SimpleNamespace:
-    """A training of each environment and variant that was let alone, its folder; its seconds from
-    the first checkpoint on; and `start`, which begins another one like it in a folder.
-    """
-    folder, begin = tmp_path_factory.mktemp("undisturbed") / "run", partial(start, *request.param)
-    process = begin(folder)
-    while not begun(folder) and process.poll() is None:
+@pytest.mark.parametrize(("environment", "variant"), product(ENVIRONMENTS, VARIANTS))
+def test_a_killed_training_ends_with_the_same_bits(environment, variant, tmp_path) -> None:
+    begin = partial(start, environment, variant)
+    undisturbed = tmp_path / "undisturbed"
+    process = begin(undisturbed)
+    while not training(undisturbed) and process.poll() is None:
         time.sleep(0.01)
     began = time.monotonic()
     finish(process)
     seconds = time.monotonic() - began
-    return SimpleNamespace(folder=folder, seconds=seconds, start=begin)
-
-
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_a_killed_training_ends_with_the_same_bits(undisturbed, moment, tmp_path) -> None:
-    delay = random.uniform(0, 0.8 * undisturbed.seconds) if moment == "training" else 0.0
-    for attempt in range(ATTEMPTS):  # a training may be faster than the undisturbed one
-        folder = tmp_path / str(attempt)
-        if kill_at(MOMENTS[moment], delay / 2**attempt, undisturbed.start(folder), folder):
-            break
-    else:
-        pytest.fail("each training ended before it was hit")
-    cut = begun(folder) and files.RECORD not in names(folder)  # has to be resumed
-    finish(undisturbed.start(folder))
-    assert files_in(folder) == sorted([*RESULTS, files.CHECKPOINT])  # to go on from
-    for name in OUTCOME:
-        assert (folder / name).read_bytes() == (undisturbed.folder / name).read_bytes(), name
-    assert provenance_of(folder)["interruptions"] or not cut, "it started afresh"
+    for moment, has_come in MOMENTS.items():
+        delay = random.uniform(0, 0.8 * seconds) if moment == "training" else 0.0
+        for attempt in range(ATTEMPTS):  # a training may be faster than the undisturbed one
+            folder = tmp_path / f"{moment}-{attempt}"
+            if kill_at(has_come, delay / 2**attempt, begin(folder), folder):
+                break
+        else:
+            pytest.fail(f"{moment}: each training ended before it was hit")
+        cut = begun(folder) and files.RECORD not in names(folder)  # has to be resumed
+        finish(begin(folder))
+        assert files_in(folder) == sorted([*RESULTS, files.CHECKPOINT])  # to go on from
+        for name in OUTCOME:
+            made, expected = (its / name for its in (folder, undisturbed))
+            assert made.read_bytes() == expected.read_bytes(), made
+        assert provenance_of(folder)["interruptions"] or not cut, f"{moment}: it started afresh"

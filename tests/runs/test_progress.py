@@ -56,7 +56,7 @@ DONE = {"seconds": 130.0, "start_seconds": 30.0}
 
 
 def test_the_table(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no run in it or below it, and no logs"):
+    with pytest.raises(ConfigError, match="no run in it or below it has told its progress, and"):
         status(tmp_path)
     folder = Folder(tmp_path, cores=2)
     folder.add(record=DONE, due=False, old=("record",))  # by an earlier workflow
@@ -80,14 +80,17 @@ def test_runs_without_a_workflow(tmp_path: Path) -> None:
     folder.add("A", record=DONE | {"config": named})
     folder.add("B", told=told(50, 60.0) | named, held=True)
     folder.add("C", told=told(90, 60.0) | named)
-    folder.add("D", record=DONE | {"config": named}, told=told(50, 60.0) | named, held=True)
+    done = {"record": DONE | {"config": named}, "old": ("record",)}
+    folder.add("D", told=told(50, 60.0) | named, held=True, **done)
+    folder.add("E", told=told(50, 60.0) | named, **done)
     heading, names, *rows = [" ".join(line.split()) for line in status(tmp_path)]
-    assert heading == "1 of 4 runs done, 2 running, 1 stopped; about 60 s left"
+    assert heading == "1 of 5 runs done, 2 running, 2 stopped; about 60 s left"
     assert names == "folder environment variant seed episode return β steps/s left"
     assert rows == [
         "runs/B/ppo/seed1 E ppo 3 50/100 21.5 0.25 1830 60 s",
         "runs/C/ppo/seed2 E ppo 3 90/100 21.5 0.25 1830 stopped",
         "runs/D/ppo/seed3 E ppo 3 50/100 21.5 0.25 1830 60 s",  # done, it goes on
+        "runs/E/ppo/seed4 E ppo 3 50/100 21.5 0.25 1830 stopped",  # it went on
     ]
 
 

@@ -1,6 +1,7 @@
 """One run on disk: what it leaves and says, and what it keeps out of its folder."""
 
 import hashlib
+import json
 import os
 import re
 import shlex
@@ -28,10 +29,10 @@ from mace_rl.base.files import CHECKPOINT, LOCK, RECORD
 from mace_rl.base.tables import RecordError
 from mace_rl.environments import hopper
 from mace_rl.runs import provenance, run
-from mace_rl.runs.finished import read_runs
+from mace_rl.runs.finished import in_the_way, read_runs
 
 
-def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
+def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained, tmp_path):
     settings = {"variant": "mace_full", "episodes": 5}
     config, directory = run_config(**settings), trained(**settings)
     assert files(directory) == RESULTS
@@ -47,6 +48,13 @@ def test_tables_hold_the_records_and_run_json_their_origin(run_config, trained):
     ]:
         with pytest.raises(RecordError, match=rf"run\.json is of another run: {said}"):
             read_runs(record, [(*run[:2], seed, 5)], {run[:2]: settings_})
+    # A record of before a setting was there is of the same settings, with its default.
+    older = config.settings()
+    del older["ppo"]["clip_actions"]
+    found = provenance_of(directory) | {"config": older}
+    (tmp_path / "run.json").write_text(json.dumps(found))
+    assert in_the_way([(tmp_path, config.settings())]) == {tmp_path: ""}
+    assert in_the_way([(tmp_path, sharp)]) == {tmp_path: "ppo.clip was 0.2 and is 0.3"}
     frame = pd.read_csv(directory / "diagnostics.csv")
     expected = [vars(record) for record in trainer.diagnostics]
     np.testing.assert_equal(frame.to_dict("records"), expected)

@@ -79,7 +79,7 @@ def test_an_environment_that_ends_by_itself_needs_no_limit(run_config, register)
 
 def test_one_that_does_not_end_is_told_after_many_steps(run_config, monkeypatch):
     monkeypatch.setattr(environments, "UNLIMITED", 50)
-    with refused(ConfigError, "goes on after 50 steps: --max-episode-steps"):
+    with refused(ConfigError, "goes on after 50 steps: in training --max-episode-steps"):
         finish(run_config("CliffWalking-v1", "ppo", 0, episodes=5))
 
 
@@ -96,6 +96,7 @@ def test_one_that_does_not_end_is_told_after_many_steps(run_config, monkeypatch)
             (wrong, None)
             for wrong in ("m:C(1)", "m:C(a=f())", "m:C(a=1", "m:C(**{})", "m:C(a=b)", "C(a=1)(b=2)")
         ),
+        *((wrong, None) for wrong in ("m:C(a={[1]: 2})", "m:C(a=1, a=2)")),
     ],
 )
 def test_arguments_by_name_are_literals(text, expected):

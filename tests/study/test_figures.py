@@ -1,6 +1,7 @@
 """Figures and pictures: their data against pandas, scipy and loops, and what files they give."""
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import matplotlib
@@ -12,8 +13,10 @@ from invented import (
     CLAIMS,
     QUESTIONED,
     QUICK,
+    ROBUST,
     SEEDS,
     STUDY,
+    VARIANTS,
     table_for_claims,
     table_for_questions,
     table_for_scores,
@@ -27,6 +30,7 @@ from mace_study.compare.verdicts import ledger
 from mace_study.config.metrics import ConstantsConfig, FigureConfig, MetricsConfig
 from mace_study.show import curves as c
 from mace_study.show.pictures import PICTURES, Source
+from mace_study.show.pictures import _what as words
 
 METRICS = STUDY.metrics.model_copy(update={"moving_average": 5, "bootstrap_repetitions": 500})
 RETURN, BETA = c.quantity("1", METRICS), c.quantity("2", METRICS)
@@ -278,6 +282,13 @@ def test_the_forest_has_every_part_in_units_of_the_margin(ledgers, family, setti
             assert row["outcome"] == part.outcome and row["answer"] == judged.outcome
             assert row["size"] == part.size
         assert not rows.duplicated(["claim", "part"]).any()  # the words tell parts from each other
+
+
+def test_parts_over_zero_are_told_apart_by_their_variants(ledgers, settings) -> None:
+    part = ledgers[0][0].ways[ROBUST].parts[0]
+    parts = [replace(part, variant=name, baseline=None) for name in VARIANTS]
+    source = Source({}, [], settings, CLAIMS.model_copy(update={"variants": {"ppo": "PPO"}}))
+    assert [words(each, parts, source) for each in parts] == ["PPO", *VARIANTS[1:]]
 
 
 @pytest.mark.parametrize(

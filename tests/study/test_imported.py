@@ -70,6 +70,11 @@ MISTAKES = {  # a file, options, what is said
     "cut off": ('#{"t_start": 1}\nr,l,t\n1.5,3,1\n2.5', "", "line 4: it ends before its t"),
     "no length": ("r,l\n1.5,0\n", "", "line 2: l is '0', not a whole number from 1 on"),
     "head": ("#x\nr,l\n1,1\n", "", "line 1: no text, or no head of a Monitor"),
+    "two runs": (
+        "task,seed,return\nA,0,1\nA,1,1\n",
+        "",
+        "line 3: seed is '1' after '0': another run",
+    ),
     "variant": (GOOD, "--variant a/b", "--variant has 'a/b', but a name here becomes a folder"),
 }
 

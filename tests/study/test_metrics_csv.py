@@ -134,7 +134,8 @@ def test_metrics_of_the_users_own_follow_in_metrics_csv(custom, tmp_path):
 
 NO_METRIC = [  # what is given, and what is said of it
     (3, "is no mace_study.measure.metrics.Metric but of type int"),
-    (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has such"),
+    (m.Metric("seed", "S", "return", min), "has the name 'seed', but metrics.csv has a"),
+    (m.Metric("solved", "S", "episodes", min), "'solved', but metrics.csv"),  # of other studies
     (m.Metric("a,b", "A", "return", min), "has the name 'a,b', but a column's name should"),
     (m.Metric("s", "S", "steps", min), "has the unit 'steps', but should have one of episodes"),
     (m.Metric("y", "Y", "share", lambda curve: 50.0), "50.0, but should be a finite number from 0"),

@@ -92,6 +92,7 @@ variant_settings: {ppo: {label: _plain}}  # variant_settings.ppo.label, '_plain'
 variant_settings: {ppo: {label: "a\\nb"}}  # variant_settings.ppo.label, 'a\\nb', one line
 variant_settings: {ppo: {colour: bluish}}  # variant_settings.ppo.colour, 'bluish', tab:blue
 variant_settings: {ppo: {memory: {capacity: 7}}}  # settings.ppo, 'memory', 'none' does not use
+variant_settings: {mace_full: {beta: {objective: {recent: 1}}}}  # recent, 1, or equal to 2
 variant_settings: {ppo: {seed: 3}}  # variant_settings.ppo.seed, 3, seeds
 variant_settings: {x: {beta: BETA, bonus: {kind: rnb}}}  # settings.x, bonus is {'kind': 'rnb'}
 variant_settings: {x: {beta: BETA, bonus: {kind: rnd}}}  # and extras/ has this one, kind: custom

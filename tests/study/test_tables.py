@@ -223,6 +223,20 @@ def test_a_cell_in_each_rendering() -> None:
     )
 
 
+def test_a_table_names_the_packages_of_all_its_words() -> None:
+    cyrillic = r"% Needs \usepackage{booktabs} \usepackage[T2A,T1]{fontenc}"
+    data, paper = table1(metrics(), QUICK), CLAIMS.table1
+    captioned = paper.model_copy(update={"caption": "Шаги"})
+    labelled = CLAIMS.table2.model_copy(update={"others": {"gae_lambda": "Шаги"}})
+    for fragment, expected in (
+        (table1_latex(data, {}, QUICK, paper), r"% Needs \usepackage{booktabs}"),
+        (table1_latex(data, {}, QUICK, captioned), cyrillic),
+        (table1_latex(data, {"ppo": "Шаги"}, QUICK, paper), cyrillic),
+        (table2_latex({"A-v0": PPO}, labelled), cyrillic),
+    ):
+        assert fragment.splitlines()[0] == expected
+
+
 @pytest.mark.skipif(NO_LATEX, reason="needs pdflatex")
 def test_pdflatex_compiles_every_fragment_within_the_margins(tmp_path: Path) -> None:
     many = metrics([*ENVIRONMENTS, "Under_score-v0", "MountainCarContinuous-v0"], seeds=12)

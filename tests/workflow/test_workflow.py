@@ -167,6 +167,7 @@ MODES = {  # options, with a file taken away before, and what the last lines the
     "--omit-from pictures": ("figure1.pdf", "results/table1.tex, results/table2.tex"),
     "--batch all=1/2": (None, "results/table1.tex"),
     "--summary": (None, "no update"),
+    "--config replace=true": (None, "Nothing to be done"),
     "--delete-all-output --dry-run": (None, "Would delete results/"),
 }
 
@@ -236,6 +237,9 @@ def test_what_a_change_runs_again(finished: Project, edit, file, old, new, expec
     assert finished.planned() == expected
 
 
+SLURM = "--workflow-profile profiles/slurm -j 9 --cores 1"  # which on a cluster are two things
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
@@ -245,6 +249,7 @@ def test_what_a_change_runs_again(finished: Project, edit, file, old, new, expec
         ("--config claims=latin1.yaml", "config.yaml: latin1.yaml: cannot be read: it is"),
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
         ("--configfile config.yaml --configfiles config.yaml", "--configfile is there 2 times"),
+        (f"{SLURM} --config a=1 --config b=2", "--config is there 2 times"),
         ("--config metrics.threshold=1", "--config has 'metrics.threshold=1', but should have"),
     ],
 )

@@ -49,9 +49,10 @@ RECORDS = [f"{run}/{files.RECORD}" for run in plan.folders]
 MEASURED = ("metrics", "betas", "readings", *FIGURES)
 
 
-# How the study is carried out, for what tells where it comes from. Where its results are is no part.
+# How the study is carried out, for what tells where it comes from. Where its results are, and what
+# they replace, is no part.
 COMMAND = ["snakemake", "all", *(["--configfile", *config_files[1:]] if config_files[1:] else [])]
-if changed := [option for option in options if not option.startswith("results=")]:
+if changed := [option for option in options if not option.startswith(("results=", "replace="))]:
     COMMAND += ["--config", *changed]
 COMMAND = shlex.join(COMMAND)
 

@@ -48,6 +48,14 @@ def content(path: str | Path) -> bytes:
         return file.read()
 
 
+def newer(path: Path, other: Path) -> bool:
+    """Whether both files are there, and `path` was written last."""
+    try:
+        return path.stat().st_mtime_ns > other.stat().st_mtime_ns
+    except FileNotFoundError:
+        return False
+
+
 def folder_of(environment: str) -> str:
     """What the folder of an environment's runs is called; no id has the '+' that stands for '/'."""
     return environment.replace("/", "+")

@@ -11,7 +11,7 @@ import numpy as np
 
 from mace_rl.numerics.compiling import kernel
 from mace_rl.numerics.elementary import f32, fma, sigmoid, tanh
-from mace_rl.numerics.matmul import add_product, product
+from mace_rl.numerics.matmul import add_product, padded, product
 
 
 class MetaNetwork(NamedTuple):
@@ -96,10 +96,11 @@ def add_gradient(sequence, states, network, grad_output, gradient):
     """
     (gates, cells, hidden), size, one = states, len(network.readout), f32(1)
     steps = len(sequence)
-    back = network.weight_hh.T.copy()
-    changes = np.empty_like(gates)
-    grad_hidden, grad_cell = np.empty((1, size), np.float32), np.zeros(size, np.float32)
-    nothing = np.zeros(size, np.float32)
+    back = np.zeros((4 * size, padded(size)), np.float32)
+    back[:, :size] = network.weight_hh.T
+    changes, grad_cell = np.empty_like(gates), np.zeros(size, np.float32)
+    grad_hidden = np.zeros((1, padded(size)), np.float32)
+    nothing = np.zeros(padded(size), np.float32)
     for j in range(size):
         grad_hidden[0, j] = grad_output * network.readout[j]
         gradient.readout[j] += grad_output * hidden[steps, j]

@@ -87,6 +87,8 @@ def in_units(value: float, before: Collection[float], centred: bool) -> float:
 
     centred: both are less the mean of those before.
     """
+    if centred and len({*before}) == 1:  # of whose mean rounding may leave a difference
+        return 0.0
     centre = mean(before) if centred and before else 0.0
     usual = deviation(before, centre)
     return min(max((value - centre) / usual, -LARGEST), LARGEST) if usual > 0 else 0.0

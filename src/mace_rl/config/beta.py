@@ -1,6 +1,6 @@
 """Settings of `mace_rl.beta`: what sets β, from nothing to the meta-adaptation network."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
@@ -28,12 +28,15 @@ class MetaConfig(Section):
     reads: bool = True  # false: it sees a constant, whatever was played; to see what reading does
 
 
+Several = Annotated[int, Field(ge=2, le=10**7)]  # of one alone nothing says what is usual
+
+
 class ReturnObjective(Section):
     """`mace_rl.beta.objectives.Return`: the public code's loss, connected."""
 
     kind: Literal["return"]
     centred: bool  # less the mean of the last returns
-    recent: Count  # of these: they also say what size is usual
+    recent: Several  # of these: they also say what size is usual
 
 
 class PerturbedObjective(Section):
@@ -42,7 +45,7 @@ class PerturbedObjective(Section):
     window: Count  # episodes for which a perturbation stays
     noise: PositiveFloat  # its size, in β's logit
     lag: float = Field(ge=1)  # episodes after which it acts
-    recent: Count  # payments that say what is usual
+    recent: Several  # payments that say what is usual
 
 
 class ScoreObjective(PerturbedObjective):

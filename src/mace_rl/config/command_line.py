@@ -8,8 +8,11 @@ from mace_rl.config.reading import read_options, read_yaml
 from mace_rl.config.section import ConfigError
 
 
-def checked() -> argparse.Namespace:
-    """The `cores` and `configfile` of the command; exits with one line where they are wrong."""
+def checked(cluster: bool = False) -> argparse.Namespace:
+    """The `cores` and `configfile` of the command; exits with one line where they are wrong.
+
+    On a cluster -j and --cores are two things: jobs in its queue, and cores of each.
+    """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--snakefile", "-s", default="Snakefile")
     parser.add_argument("--cores", "-c", nargs="?", const="all")
@@ -27,7 +30,7 @@ def checked() -> argparse.Namespace:
         for file in [*Path(given.snakefile).parent.glob("config.yaml"), *given.configfile]:
             read_yaml(Path(file))
         read_options(given.config)
-        if given.cores and given.jobs and given.cores != given.jobs:
+        if given.cores and given.jobs and given.cores != given.jobs and not cluster:
             raise ConfigError(
                 f"-j {given.jobs} and --cores {given.cores} contradict each other: give one of them"
             )

@@ -51,10 +51,11 @@ def call_of(text: str) -> tuple[str, dict[str, Any]]:
         call: Any = ast.parse(f"f({rest}", mode="eval").body
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.args:
             raise ValueError
-        if not all(one.arg for one in call.keywords):
+        names = [one.arg for one in call.keywords]
+        if None in names or len({*names}) < len(names):
             raise ValueError
         return name, {str(one.arg): ast.literal_eval(one.value) for one in call.keywords}
-    except (SyntaxError, ValueError):
+    except (SyntaxError, TypeError, ValueError):  # TypeError: a list as the key of a dictionary
         raise ValueError("it should be a name, or name(key=literal, ...)") from None
 
 

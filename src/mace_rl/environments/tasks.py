@@ -151,7 +151,7 @@ class BarrenRegion(gymnasium.Env):
     to 3 go north, east, south and west, or nowhere if there is a wall (#). In the room the
     observation has a screen with new random numbers every step; elsewhere these are 0.
 
-    `screen=0` is the control: no numbers. docs/study.md has what came out.
+    `screen=0` is the control: no numbers.
 
     Observation: east and north of the map's middle, each from -1 to 1; then `screen` numbers in
     [-1, 1]; float32 [2 + screen].

@@ -25,11 +25,11 @@ def evaluate(
     environment, policy = player.environment, player.acting(deterministic)
     rollout = rollout_for(environment, policy)
     generator = np.random.default_rng(seed)
-    returns = np.empty(episodes)
+    returns: list[float] = []
     with seeded(drawn):
         environment.env.reset(seed=seed)
-        for episode in range(episodes):
+        for _ in range(episodes):
             played = rollout(environment, policy, draw_noise(environment, generator))
-            returns[episode] = total(played.rewards)
+            returns.append(total(played.rewards))
     environment.env.close()
-    return returns
+    return np.array(returns)

@@ -54,9 +54,11 @@ def write(run: Path, out: Path) -> None:
 def read(run: Path) -> dict[str, pd.DataFrame]:
     """The tables of a run by the prefix of their tags, with the episode as their index.
 
-    From its files or its checkpoint; raises what their reading raises.
+    From its files, or its checkpoint if it is not finished or goes on; raises what their reading
+    raises.
     """
-    if (run / files.RECORD).exists():
+    record, goes_on = run / files.RECORD, files.newer(run / files.CHECKPOINT, run / files.RECORD)
+    if record.exists() and not goes_on:
         finished = FinishedRun(run)
         both = {"episodes": finished.episodes, "updates": finished.diagnostics}
         there = {prefix: table for prefix, table in both.items() if table is not None}

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -147,6 +148,8 @@ def in_the_way(runs: Iterable[tuple[Path, Mapping[str, Any]]]) -> dict[Path, str
         if (folder / files.RECORD).exists():
             own, wanted = read_record(folder / files.RECORD)["config"], dict(settings)
             plain = json.loads(json.dumps(wanted))
+            with suppress(ConfigError):  # some settings are of another version
+                own = completed(own, plain, str(folder))
             found[folder] = "" if own == plain else difference(own, plain)
     return found
 
@@ -175,10 +178,18 @@ def read_runs(
 def require_settings(own: Mapping[str, Any], wanted: Mapping[str, Any], origin: str) -> None:
     """`RecordError`, begun by `origin`, unless a run with the configuration `own` is as `wanted`.
 
-    wanted: plain values. A record may lack what is new since, and has a default.
+    wanted: plain values.
     """
-    if own != wanted and (own := check(RunConfig, own, origin).settings()) != wanted:
+    if (own := completed(own, wanted, origin)) != wanted:
         raise RecordError(f"{origin} is of another run: {difference(dict(own), dict(wanted))}")
+
+
+def completed(own: Mapping[str, Any], wanted: Mapping[str, Any], origin: str) -> Mapping[str, Any]:
+    """The recorded configuration `own`; unless it is as `wanted`, with defaults for what is new.
+
+    `ConfigError`, begun by `origin`, if it is none today.
+    """
+    return own if own == wanted else check(RunConfig, own, origin).settings()
 
 
 def finished(config: RunConfig, directory: Path) -> bool:
@@ -215,10 +226,12 @@ def finished(config: RunConfig, directory: Path) -> bool:
 def difference_from(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
     """How the run with the identity `found` differs from the `wanted` one of `config`, in words."""
     code = " or ".join([*config.references().values(), "mace_rl"])
+    if not only_budget(found, wanted):  # then the budget is no obstacle, and is not named
+        found = found | {"config": found["config"] | {"episodes": config.episodes}}
     if found | {"sources": wanted["sources"]} == wanted:
         return f"of other code, in {code}"
     reason = ""
-    if found["config"]["episodes"] < config.episodes and only_budget(found, wanted):
+    if found["config"]["episodes"] < config.episodes:
         rule = needs_budget(config)
         reason = ", without a checkpoint to go on from"
         reason = f", which beta.rule {rule!r} needs to know" if rule else reason

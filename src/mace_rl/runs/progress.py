@@ -140,7 +140,8 @@ def status(results: Path) -> list[str]:
             for run in plan.runs
         ]
     elif not (runs := [*unplanned(results)]):
-        raise ConfigError(f"{results}: no run in it or below it, and no {files.PLAN} of a workflow")
+        reason = f"no run in it or below it has told its progress, and no workflow its {files.PLAN}"
+        raise ConfigError(f"{results}: {reason}")
     states = Counter(run.state for run in runs)
     counts = [f"{states[state]} {state}" for state in ("running", "waiting", "stopped")]
     shown = [f"{states['done']} of {len(runs)} runs done", *(c for c in counts if c[:2] != "0 ")]
@@ -168,7 +169,7 @@ class Run:
         self.seconds = math.nan  # of the whole training, if known
         if (progress or not record) and held(folder / files.LOCK):  # a finished run may go on
             self.state = "running"
-        elif record:
+        elif record and not files.newer(folder / files.PROGRESS, folder / files.RECORD):
             self.state, self.seconds = "done", record["seconds"] - record["start_seconds"]
         else:
             self.state = "stopped" if progress else "waiting"

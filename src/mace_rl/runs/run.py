@@ -90,12 +90,12 @@ def run(
         identity, code = provenance.identity(config), provenance.git_state()
         trainer = trainer_of(config)
         end.callback(trainer.environment.env.close)
+        clock = Clock(started)  # before files are moved: a wrong interval is refused
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:
             logger.warning("the fast path for %s is not taken: %s", config.environment, slow)
         gc.freeze()  # the collector need not look again at what stays
-        clock = Clock(started)
         if state is not None:
             resume(trainer, clock, state)
         checkpoint.require_plain(trainer.state_dict(), "state")  # now rather than after minutes

@@ -56,7 +56,7 @@ def endless(environment: Environment) -> str:
     if environment.ends_by_itself:
         return (
             f"has no time limit, and an episode of it goes on after {steps} steps: "
-            f"--max-episode-steps or {setting} should set one"
+            f"in training --max-episode-steps or {setting} should set one"
         )
     return f"goes on after {steps} steps, its time limit: a wrapper hides `truncated`"
 

@@ -4,6 +4,8 @@ The score of a run is (A - r₀) / (A* - r₀), where A is its final return or i
 of training, r₀ the random policy's and A* the best run's of the study in that environment.
 """
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import scipy
@@ -32,10 +34,11 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
     """The data of aggregate.csv: of each metric and variant the mean and interquartile mean score.
 
     Columns: metric, variant, runs, then for mean and iqm the estimate and its interval, NaN if an
-    environment has one seed. Every environment weighs as much as it has runs. Variants that do not
-    have runs in all environments are left out.
+    environment has fewer than 10 seeds. Every environment weighs as much as it has runs. Variants
+    that do not have runs in all environments are left out.
     """
-    rows, repetitions = [], settings.bootstrap_repetitions
+    rows: list[dict[str, Any]] = []
+    repetitions = settings.bootstrap_repetitions
     everywhere = table.groupby("variant")["env"].nunique() == table["env"].nunique()
     scored = scores(table, settings)
     scored = scored[scored["variant"].map(everywhere)]
@@ -53,4 +56,5 @@ def aggregate(table: pd.DataFrame, settings: MetricsConfig) -> pd.DataFrame:
             value = float(estimate(np.concatenate(strata), axis=-1))
             row |= {name: value, f"{name}_low": low, f"{name}_high": high}
         rows.append(row)
-    return pd.DataFrame(rows)
+    ends = [f"{name}{end}" for name in ("mean", "iqm") for end in ("", "_low", "_high")]
+    return pd.DataFrame(rows, columns=["metric", "variant", "runs", *ends])

@@ -178,9 +178,13 @@ def parts_of(family: FamilyConfig) -> list[tuple[str, PartsConfig]]:
     ]
 
 
-def too_few(seeds: int) -> str:
-    """Why nothing is decided with so many."""
-    return f"that takes {FEWEST_SEEDS} seeds, and there are {seeds}"
+def undecided(seeds: Sequence[int]) -> str:
+    """What has no verdict where parts, or environments, have so many seeds each; "" if all has."""
+    if max(seeds) < FEWEST_SEEDS:
+        few = f"that takes {FEWEST_SEEDS} seeds, and there are {max(seeds)}"
+        return f"no claim can have a verdict: {few}"
+    fewer = f"parts with fewer than {FEWEST_SEEDS} seeds decide nothing"
+    return fewer if min(seeds) < FEWEST_SEEDS else ""
 
 
 def parse_claims(path: str | Path, learned: str = LEARNED) -> ClaimsConfig:
@@ -213,8 +217,9 @@ def read_claims(study: "Study", path: str | Path) -> ClaimsConfig:
         _check_names(claims, study)
         _check_form(claims)
         require_latex(claims.table1.caption, "table1.caption")
-        for name in claims.table2.rows.values():
-            require_latex(name, "table2.rows")
+        for key, names in claims.table2.model_dump().items():
+            for name in names.values():
+                require_latex(name, f"table2.{key}")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return claims

@@ -11,7 +11,7 @@ import scipy  # loads what is used of it when it is: scipy.stats alone takes a s
 
 from mace_study.config.metrics import MetricsConfig
 
-BOOTSTRAP_SEEDS = 10  # with fewer seeds a bootstrap interval is too narrow: t is used instead
+BOOTSTRAP_SEEDS = 10  # with fewer a bootstrap interval is too narrow: of a mean t's is taken
 CHUNK = 2**20  # resampled values held in memory at a time
 BATCH = 1000  # resamples of a test at a time: faster than all 10000, which caches cannot hold
 REMEMBERED = 64  # draws: some MB each
@@ -301,9 +301,10 @@ def percentiles(estimates: np.ndarray, confidence: float, seeds: int) -> np.ndar
 
     The expanded percentile interval (Hesterberg 2015): percentiles moved outward as much as
     Student's t is wider than the normal distribution with so few `seeds`, over which a bootstrap is
-    too narrow otherwise (docs/metrics.md). NaN with one seed, and where one of `estimates` is NaN.
+    too narrow otherwise (docs/metrics.md). NaN below `BOOTSTRAP_SEEDS`, and where one of
+    `estimates` is NaN.
     """
-    if seeds == 1:
+    if seeds < BOOTSTRAP_SEEDS:
         return np.full((2, *estimates.shape[1:]), np.nan)
     wider = np.sqrt(seeds / (seeds - 1)) * scipy.special.stdtrit(seeds - 1, (1 + confidence) / 2)
     tail = 100 * scipy.special.ndtr(-wider)

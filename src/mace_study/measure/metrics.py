@@ -259,14 +259,14 @@ def all_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
         metric for metric in METRICS if metric.needs is None or getattr(settings, metric.needs)
     ]
     for reference in settings.custom:
-        metric, columns = load(reference, "metrics.custom"), metrics_columns(metrics)
+        metric, columns = load(reference, "metrics.custom"), metrics_columns([*METRICS, *metrics])
         if not isinstance(metric, Metric):
             problem = f"is no {__name__}.Metric but of type {type(metric).__name__}"
         elif not metric.name.isidentifier():
             problem = f"has the name {metric.name!r}, but a column's name should be a word"
         elif {metric.name, metric.flag} & {*columns, *OF_BETAS}:
             place = "betas.csv" if metric.name in OF_BETAS else "metrics.csv"
-            problem = f"has the name {metric.name!r}, but {place} has such a column already"
+            problem = f"has the name {metric.name!r}, but {place} has a column of that name"
         elif metric.unit not in COLUMN_TYPES:
             units = ", ".join(COLUMN_TYPES)
             problem = f"has the unit {metric.unit!r}, but should have one of {units}"

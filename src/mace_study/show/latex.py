@@ -27,21 +27,21 @@ def table1_latex(
         what = f", in training episodes. Lower is better{both}; {best}"
     caption = escaped(paper.caption) + what + _how(table, settings.confidence)
     frame = tables.table1(tables.named(table, labels), settings, paper)
-    return latex_float(caption, "tab:table1", frame)
+    needs = packages(" ".join([paper.caption, *frame.columns, *frame[frame.columns[0]]]))
+    return latex_float(needs, caption, "tab:table1", frame)
 
 
 def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
     """Table 2, the PPO hyperparameters: the paper's rows, a line, and this project's."""
-    rows = [
-        f"\\raggedright {escaped(name)} & {latex_cell(value)} \\\\"
-        for name, value in tables.table2(ppo, paper).to_numpy()
-    ]
+    found = tables.table2(ppo, paper).to_numpy()
+    rows = [rf"\raggedright {escaped(name)} & {latex_cell(value)} \\" for name, value in found]
+    needs = packages(" ".join(name for name, _ in found))
     end = len(paper.rows) + 1  # and Adam
     what = "PPO hyperparameters: those of the paper, and below the line those that it leaves open."
     columns = r"tabular}{@{}p{0.42\linewidth}l@{}"
     body = [*rows[:end], r"\midrule", *rows[end:]]
     lines = _lines(columns, r"Hyperparameter & Value \\", *body)
-    return _float("table", packages(""), what, "tab:table2", *lines)
+    return _float("table", needs, what, "tab:table2", *lines)
 
 
 def _how(table: pd.DataFrame, confidence: float) -> str:
@@ -66,13 +66,12 @@ def _how(table: pd.DataFrame, confidence: float) -> str:
     return text
 
 
-def latex_float(caption: str, label: str, frame: pd.DataFrame) -> str:
-    """A table for \\input, as wide as the page; its first line says what the preamble needs."""
+def latex_float(needs: list[str], caption: str, label: str, frame: pd.DataFrame) -> str:
+    """A table for \\input, as wide as the page; its first line says what the preamble `needs`."""
     head, *names = frame.columns
     starts = range(0, len(names), COLUMNS_PER_BLOCK)
     blocks = [names[start : start + COLUMNS_PER_BLOCK] for start in starts]
     tabulars = "\n\\par\\medskip\n".join(_tabular(frame[[head, *block]]) for block in blocks)
-    needs = packages(" ".join([*frame[head], *names]))
     return _float("table*", needs, caption, label, r"\setlength{\tabcolsep}{2pt}", tabulars)
 
 

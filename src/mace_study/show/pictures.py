@@ -187,10 +187,10 @@ def _what(part: Finding, parts: Sequence[Finding], source: Source) -> str:
     if any(other.metric != part.metric for other in parts):
         words.append(metric)
     called = source.claims.variants
-    if part.baseline:
-        over = f"over {called.get(part.baseline, part.baseline)}"
-        differ = any(other.variant != part.variant for other in parts)
-        words.append(f"{called.get(part.variant, part.variant)} {over}" if differ else over)
+    variant = called.get(part.variant, part.variant)
+    differ = [variant] if any(other.variant != part.variant for other in parts) else []
+    over = [f"over {called.get(part.baseline, part.baseline)}"] if part.baseline else []
+    words += [" ".join([*differ, *over])] if differ or over else []
     return ", ".join(words) or metric
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from mace_rl.base.tables import read_made, read_table
-from mace_study.compare.claims_config import FEWEST_SEEDS, ClaimsConfig, parts_of, too_few
+from mace_study.compare.claims_config import ClaimsConfig, parts_of, undecided
 from mace_study.compare.comparisons import ALL
 from mace_study.compare.ledger import Answer
 from mace_study.compare.summary import from_to
@@ -72,9 +72,8 @@ def of_ledger(answers: Sequence[Answer], claims: ClaimsConfig) -> Iterator[Secti
         verdicts = "; ".join(f"{how}: {counted(family, how, claims)}" for how in family[0].ways)
         note = f"Of {len(family)}, {verdicts}. The rule: docs/metrics.md."
         ways = [way for answer in family for way in answer.ways.values()]
-        seeds = min(part.seeds for way in ways for part in way.parts)
-        if seeds < FEWEST_SEEDS:
-            note += f" No claim can have a verdict: {too_few(seeds)}."
+        if lacking := undecided([part.seeds for way in ways for part in way.parts]):
+            note += f" {lacking[0].upper()}{lacking[1:]}."
         yield Section(title[:1].upper() + title[1:], note, tables.verdicts(family))
         for how in family[0].ways:
             frame = tables.parts_in_short(family, how)

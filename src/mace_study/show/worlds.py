@@ -51,14 +51,10 @@ def verdicts(worlds: Mapping[str, Sequence[Answer]]) -> pd.DataFrame:
 def _decisive(judged: Judgement) -> tuple[Any, ...]:
     """Outcome and verdict; difference, low, high and p_holm of the part that decides.
 
-    A part reversed beside one shown makes a claim absent, though no part is.
+    A part reversed beside one shown makes a claim absent, too.
     """
-    of_parts = judged.outcome, "reversed"
-    deciding = next(
-        parts
-        for what in of_parts
-        if (parts := [part for part in judged.parts if part.outcome == what])
-    )
+    decide = {"absent", "reversed"} if judged.outcome == "absent" else {judged.outcome}
+    deciding = [part for part in judged.parts if part.outcome in decide]
     part = min(deciding, key=lambda part: (part.p_holm, -abs(part.difference)))
     verdict = judged.outcome, judged.verdict
     return *verdict, part.difference, part.low, part.high, part.p_holm
