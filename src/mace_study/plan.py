@@ -193,6 +193,6 @@ class Plan:
                     f"of {self.claims}, {title} are not judged: the study lacks {lacking[0]}"
                 )
         seeds = [study.environment_seeds.get(env, study.seeds) for env in study.environments]
-        if self.judged and (lacking := undecided([*map(len, seeds)])):
-            lines.append(lacking)
+        if self.judged and (why := undecided([*map(len, seeds)])):
+            lines.append(why)
         return lines
