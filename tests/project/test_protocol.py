@@ -22,7 +22,10 @@ PROTOCOLS = {
     "34f838d": ("docs/worlds-protocol.md", ROOT / "reference" / "worlds" / "protocol.md"),
     "ed57401": ("reference/network/protocol.md", ROOT / "reference" / "network" / "protocol.md"),
     "f396531": ("reference/minigrid/protocol.md", ROOT / "reference" / "minigrid" / "protocol.md"),
-    "08d9a0b": ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
+    **dict.fromkeys(  # the second: trained again, as reference/worlds/errata.md says
+        ("08d9a0b", "d105a38"),
+        ("reference/readings/protocol.md", ROOT / "reference" / "readings" / "protocol.md"),
+    ),
 }
 FOLDERS = sorted(set(tables.STUDIES) - set(tables.ELSEWHERE))
 
@@ -44,7 +47,7 @@ def test_what_is_kept_came_after_its_protocol_and_from_one_state_of_the_code(fol
     assert {*records} <= asked
     for config in {run[:2]: record["config"] for run, record in records.items()}.values():
         for reference in RunConfig.model_validate(config).references().values():
-            if ":" in reference and not reference.startswith("HopperBullet"):
+            if not reference.startswith("HopperBullet"):
                 load(reference, "reference")
     git, told = ["git", "-C", str(ROOT)], {"capture_output": True}
     shallow = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], check=False, **told)

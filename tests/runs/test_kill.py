@@ -85,7 +85,7 @@ def kill_at(
     return False
 
 
-@pytest.mark.parametrize(("environment", "variant"), product(ENVIRONMENTS, VARIANTS))
+@pytest.mark.parametrize(("environment", "variant"), [*product(ENVIRONMENTS, VARIANTS)])
 def test_a_killed_training_ends_with_the_same_bits(environment, variant, tmp_path) -> None:
     begin = partial(start, environment, variant)
     undisturbed = tmp_path / "undisturbed"
