@@ -122,10 +122,7 @@ def write_readme(name: str) -> None:
 
 
 def difference(name: str, outputs: list[str], check: bool) -> list[str]:
-    """The outputs that are not those in `EXPECTED`, where new ones and pages go, unless `check`.
-
-    And what is there, but is made no longer.
-    """
+    """What is not as in `EXPECTED`, or gone; new files and pages go there, unless `check`."""
     different = []
     for output in outputs:
         made, expected = MADE / name / output, EXPECTED / name / output
@@ -137,8 +134,7 @@ def difference(name: str, outputs: list[str], check: bool) -> list[str]:
         print(f"{'renewed' if expected.exists() else 'new'}: {expected}")
         expected.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(made, expected)
-    kept_files = sorted(path.name for path in (EXPECTED / name).glob("*"))
-    gone = [output for output in kept_files if output not in outputs]
+    gone = sorted({path.name for path in (EXPECTED / name).glob("*")}.difference(outputs))
     return [*different, *(f"{EXPECTED / name / output}, no longer made" for output in gone)]
 
 
