@@ -135,7 +135,7 @@ def difference(name: str, outputs: list[str], check: bool) -> list[str]:
         expected.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(made, expected)
     gone = sorted({path.name for path in (EXPECTED / name).glob("*")}.difference(outputs))
-    return [*different, *(f"{EXPECTED / name / output}, no longer made" for output in gone)]
+    return [*different, *(f"{EXPECTED / name / output} (no longer made)" for output in gone)]
 
 
 def main() -> None:
@@ -170,6 +170,7 @@ def main() -> None:
     different = [
         path for name in outputs for path in difference(name, outputs[name], arguments.check)
     ]
+    different += sorted(str(path) for path in EXPECTED.iterdir() if path.name not in outputs)
     count, runs = sum(map(len, outputs.values())), sum(runs for runs, _ in made.values())
     print(f"{count} tables and figures of {len(made)} studies from {runs} runs, in {MADE}")
     if different:

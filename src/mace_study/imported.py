@@ -26,6 +26,7 @@ from mace_rl.config.run import IDENTITY
 from mace_rl.config.section import ConfigError, check
 from mace_rl.run_settings import check_name
 from mace_rl.runs import provenance
+from mace_rl.runs.export import RUN
 from mace_rl.runs.finished import FinishedRun
 from mace_rl.training.records import EpisodeRecord, as_columns, write_episodes
 
@@ -34,7 +35,6 @@ MONITORS = "*monitor.csv"
 # What columns are called, the first that is there: by Monitor, by `mace-rl export`, by others.
 RETURN = ("r", "return", "extrinsic_return", "episode_return", "episodic_return", "episode_reward")
 LENGTH = ("l", "length", "episode_length", "episodic_length")
-RUN = ("folder", "task", "algorithm", "seed")  # by which `mace-rl export` tells runs apart
 PARTS = {"beta": "β", "intrinsic_return": "bonus"}  # that a run may have, by their columns
 WRITTEN: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
 
@@ -42,7 +42,7 @@ WRITTEN: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_f
 class Row(NamedTuple):
     """One episode."""
 
-    ended: float  # when, s; 0 where the file does not say
+    ended: float  # when, s; NaN where the file does not say
     extrinsic_return: float
     length: int
     parts: dict[str, float]  # of `PARTS`, those that the file has
@@ -59,6 +59,8 @@ def read(path: Path, returns: str | None = None, lengths: str | None = None) -> 
     found = [_read(file, returns, lengths) for file in sorted(path.glob(MONITORS))]
     if not found:
         raise RecordError(f"{path}: no file in it is called {MONITORS}")
+    if any(math.isnan(row.ended) for _, part in found for row in part):
+        raise RecordError(f"{path}: a file in it has no column t, the order of episodes")
     first = min(start for start, _ in found)
     rows = [row._replace(ended=start - first + row.ended) for start, part in found for row in part]
     return sorted(rows, key=lambda row: row.ended)
@@ -79,15 +81,16 @@ def _read(path: Path, returns: str | None, lengths: str | None) -> tuple[float, 
     length = length or next((name for name in LENGTH if name in names), None)
     parts = [name for name in PARTS if name in names]
     rows: list[Row] = []
+    exported = RUN if {*RUN} <= {*names} else ()  # by which runs are told apart there
     run: dict[str, str] = {}
     try:
         for line in lines:
-            for name in set(RUN).intersection(names):
+            for name in exported:
                 if run.setdefault(name, line[name]) != line[name]:
                     raise ValueError(f"{name} is {line[name]!r} after {run[name]!r}: another run")
             rows.append(
                 Row(
-                    ended=_number(line, "t") if "t" in names else 0.0,
+                    ended=_number(line, "t") if "t" in names else math.nan,
                     extrinsic_return=_number(line, column),
                     length=_whole(line, length) if length else 1,
                     parts={name: _number(line, name) for name in parts},
@@ -167,7 +170,7 @@ def write(runs: Mapping[Path, Sequence[Row]], environment: str, variant: str, ou
             "versions": {},  # nothing is known of these, ...
             "sources": "",  # ... of the code ...
             "machine": {},  # ... and of where it ran
-            "seconds": rows[-1].ended,
+            "seconds": 0.0 if math.isnan(rows[-1].ended) else rows[-1].ended,
             "start_seconds": 0.0,
             "outputs": {files.EPISODES: provenance.file_digest(folder / files.EPISODES)},
         }

@@ -13,7 +13,7 @@ from typing import Any
 from mace_rl.base import files
 from mace_rl.environments import spec_of
 from mace_rl.runs.provenance import read_record
-from mace_study.compare.claims_config import ClaimsConfig, read_claims, undecided
+from mace_study.compare.claims_config import ClaimsConfig, parts_of, read_claims, undecided
 from mace_study.config.metrics import MetricsConfig
 from mace_study.config.study import Study
 from mace_study.measure.metrics import all_metrics, metric_units, out_of_reach
@@ -192,7 +192,13 @@ class Plan:
                 lines.append(
                     f"of {self.claims}, {title} are not judged: the study lacks {lacking[0]}"
                 )
-        seeds = [study.environment_seeds.get(env, study.seeds) for env in study.environments]
-        if self.judged and (why := undecided([*map(len, seeds)])):
+        seeds = [
+            len(study.environment_seeds.get(env, study.seeds))
+            for title, family in self.paper.families.items()
+            if not self.lacking[title]
+            for _, part in parts_of(family)
+            for env in part.environments
+        ]
+        if seeds and (why := undecided(seeds)):
             lines.append(why)
         return lines

@@ -86,11 +86,14 @@ def test_a_kept_study_is_made_compared_and_reported(tmp_path: Path, monkeypatch,
     (kept / "metrics.csv").write_bytes(metrics + b"\n")
     (kept / "README.md").unlink()
     (kept / "claims.json").touch()
+    (kept.parent / "left").mkdir()
     named = "tables: not those that are kept: reference/tables/small/metrics.csv, "
-    named += "reference/tables/small/README.md, reference/tables/small/claims.json, no longer made"
+    named += "reference/tables/small/README.md, "
+    named += "reference/tables/small/claims.json (no longer made), reference/tables/left"
     assert tabulate("--check") == (made, named)
     (kept / "metrics.csv").write_bytes(metrics)
     (kept / "claims.json").unlink()
+    (kept.parent / "left").rmdir()
     (kept / "README.md").write_text("stale")
     assert tabulate() == ("renewed: reference/tables/small/README.md\n" + made, "")
     assert (kept / "README.md").read_text() == readme

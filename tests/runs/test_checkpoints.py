@@ -180,8 +180,10 @@ def test_what_else_an_environment_draws_from_is_saved_or_noticed(
 def test_a_state_that_would_not_be_read_again_is_named(run_config, register, tmp_path):
     name = register("Draws-v0", Draws, 5, kind="offered badly")
     message = r"state.environment.remembered.own.resets is np.int64\(1\), but should be a tensor"
+    (tmp_path / "run.json").touch()
     with pytest.raises(checkpoint.CheckpointError, match=message):
-        run.run(run_config(name, "ppo", 0, episodes=2), tmp_path)
+        run.run(run_config(name, "ppo", 0, episodes=2), tmp_path, aside="all")
+    assert (tmp_path / "run.json").exists()  # nothing was moved
 
 
 @pytest.mark.parametrize("said", ["often", "-1", "nan", ""])

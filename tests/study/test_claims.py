@@ -334,7 +334,7 @@ def test_what_a_study_lacks_for_a_family() -> None:
     ("seeds", "in_hopper", "said"),
     [
         (9, 9, "No claim can have a verdict: that takes 10 seeds, and there are 9."),
-        (10, 5, "Parts with fewer than 10 seeds decide nothing."),
+        (10, 5, "Parts with fewer than 10 seeds stay open."),
         (10, 10, "The rule: docs/metrics.md."),  # alone
     ],
 )

@@ -71,7 +71,7 @@ MISTAKES = {  # a file, options, what is said
     "no length": ("r,l\n1.5,0\n", "", "line 2: l is '0', not a whole number from 1 on"),
     "head": ("#x\nr,l\n1,1\n", "", "line 1: no text, or no head of a Monitor"),
     "two runs": (
-        "task,seed,return\nA,0,1\nA,1,1\n",
+        "task,algorithm,seed,folder,return\nA,a,0,x,1\nA,a,1,x,1\n",
         "",
         "line 3: seed is '1' after '0': another run",
     ),

@@ -227,12 +227,14 @@ def test_a_table_names_the_packages_of_all_its_words() -> None:
     cyrillic = r"% Needs \usepackage{booktabs} \usepackage[T2A,T1]{fontenc}"
     data, paper = table1(metrics(), QUICK), CLAIMS.table1
     captioned = paper.model_copy(update={"caption": "Шаги"})
+    sharp = PPO.model_copy(update={"clip": 0.1})
     labelled = CLAIMS.table2.model_copy(update={"others": {"gae_lambda": "Шаги"}})
     for fragment, expected in (
         (table1_latex(data, {}, QUICK, paper), r"% Needs \usepackage{booktabs}"),
         (table1_latex(data, {}, QUICK, captioned), cyrillic),
         (table1_latex(data, {"ppo": "Шаги"}, QUICK, paper), cyrillic),
         (table2_latex({"A-v0": PPO}, labelled), cyrillic),
+        (table2_latex({"A-v0": PPO, "A-v0: Шаги": sharp}, CLAIMS.table2), cyrillic),
     ):
         assert fragment.splitlines()[0] == expected
 

@@ -19,6 +19,7 @@ from numba.core.caching import UserProvidedCacheLocator
 from shared import OUTCOME, ROOT
 
 from mace_rl.base import code_digest
+from mace_rl.config.command_line import checked
 from mace_rl.numerics import compiling
 
 pytestmark = pytest.mark.slow
@@ -237,9 +238,6 @@ def test_what_a_change_runs_again(finished: Project, edit, file, old, new, expec
     assert finished.planned() == expected
 
 
-SLURM = "--workflow-profile profiles/slurm -j 9 --cores 1"  # which on a cluster are two things
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
@@ -249,7 +247,10 @@ SLURM = "--workflow-profile profiles/slurm -j 9 --cores 1"  # which on a cluster
         ("--config claims=latin1.yaml", "config.yaml: latin1.yaml: cannot be read: it is"),
         ("-j2 --cores 1", "-j 2 and --cores 1 contradict each other"),
         ("--configfile config.yaml --configfiles config.yaml", "--configfile is there 2 times"),
-        (f"{SLURM} --config a=1 --config b=2", "--config is there 2 times"),
+        (
+            "--workflow-profile profiles/slurm --config a=1 --config b=2",
+            "--config is there 2 times",
+        ),
         ("--config metrics.threshold=1", "--config has 'metrics.threshold=1', but should have"),
     ],
 )
@@ -258,6 +259,14 @@ def test_mistakes_end_in_one_line(finished: Project, options: str, expected: str
     code, output = finished(f"snakemake -n all {options}")
     assert code == 1 and "Traceback" not in output
     assert output.splitlines()[-1].startswith(f"Error in the configuration: {expected}")
+
+
+def test_on_a_cluster_jobs_and_cores_are_two_things(monkeypatch) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["snakemake", "-j9", "--cores", "1"])
+    assert checked(cluster=True).cores == "1"
+    with pytest.raises(SystemExit, match="-j 9 and --cores 1 contradict"):
+        checked()
 
 
 def test_one_snakemake_at_a_time(finished: Project, edit) -> None:

@@ -57,12 +57,20 @@ def read(run: Path) -> dict[str, pd.DataFrame]:
     From its files, or its checkpoint if it is not finished or goes on; raises what their reading
     raises.
     """
-    record, goes_on = run / files.RECORD, files.newer(run / files.CHECKPOINT, run / files.RECORD)
-    if record.exists() and not goes_on:
-        finished = FinishedRun(run)
-        both = {"episodes": finished.episodes, "updates": finished.diagnostics}
-        there = {prefix: table for prefix, table in both.items() if table is not None}
-        return {prefix: table.set_index("episode") for prefix, table in there.items()}
+    if not (run / files.RECORD).exists():
+        return of_checkpoint(run)
+    finished = FinishedRun(run)
+    if files.newer(run / files.CHECKPOINT, run / files.RECORD):  # or was only copied later
+        later = of_checkpoint(run)
+        if len(later["episodes"]) > finished.record["config"]["episodes"]:
+            return later
+    both = {"episodes": finished.episodes, "updates": finished.diagnostics}
+    there = {prefix: table for prefix, table in both.items() if table is not None}
+    return {prefix: table.set_index("episode") for prefix, table in there.items()}
+
+
+def of_checkpoint(run: Path) -> dict[str, pd.DataFrame]:
+    """The same from its checkpoint."""
     found = checkpoint.read(run / files.CHECKPOINT)
     try:
         state = found["state"]["trainer"]

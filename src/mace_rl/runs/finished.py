@@ -226,7 +226,7 @@ def finished(config: RunConfig, directory: Path) -> bool:
 def difference_from(found: dict[str, Any], wanted: dict[str, Any], config: RunConfig) -> str:
     """How the run with the identity `found` differs from the `wanted` one of `config`, in words."""
     code = " or ".join([*config.references().values(), "mace_rl"])
-    if not only_budget(found, wanted):  # then the budget is no obstacle, and is not named
+    if not only_budget(found, wanted):  # what else differs is named first
         found = found | {"config": found["config"] | {"episodes": config.episodes}}
     if found | {"sources": wanted["sources"]} == wanted:
         return f"of other code, in {code}"

@@ -140,8 +140,8 @@ def status(results: Path) -> list[str]:
             for run in plan.runs
         ]
     elif not (runs := [*unplanned(results)]):
-        reason = f"no run in it or below it has told its progress, and no workflow its {files.PLAN}"
-        raise ConfigError(f"{results}: {reason}")
+        reason = "no run in it or below it is finished or has told its progress"
+        raise ConfigError(f"{results}: {reason}, and there is no {files.PLAN} of a workflow")
     states = Counter(run.state for run in runs)
     counts = [f"{states[state]} {state}" for state in ("running", "waiting", "stopped")]
     shown = [f"{states['done']} of {len(runs)} runs done", *(c for c in counts if c[:2] != "0 ")]

@@ -90,7 +90,9 @@ def run(
         identity, code = provenance.identity(config), provenance.git_state()
         trainer = trainer_of(config)
         end.callback(trainer.environment.env.close)
-        clock = Clock(started)  # before files are moved: a wrong interval is refused
+        # Before files are moved: what cannot be is refused now rather than after minutes.
+        clock = Clock(started)
+        checkpoint.require_plain(trainer.state_dict(), "state")
         state = to_continue(config, identity, directory, lock, aside)
         slow = fallback_reason(trainer.environment)
         if slow:
@@ -98,7 +100,6 @@ def run(
         gc.freeze()  # the collector need not look again at what stays
         if state is not None:
             resume(trainer, clock, state)
-        checkpoint.require_plain(trainer.state_dict(), "state")  # now rather than after minutes
         file = directory / files.PROGRESS
 
         def save() -> None:

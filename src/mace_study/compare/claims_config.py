@@ -179,11 +179,11 @@ def parts_of(family: FamilyConfig) -> list[tuple[str, PartsConfig]]:
 
 
 def undecided(seeds: Sequence[int]) -> str:
-    """What has no verdict where parts, or environments, have so many seeds each; "" if all has."""
+    """What has no verdict where parts, or environments, have so many seeds each; "" if all have."""
     if max(seeds) < FEWEST_SEEDS:
         few = f"that takes {FEWEST_SEEDS} seeds, and there are {max(seeds)}"
         return f"no claim can have a verdict: {few}"
-    fewer = f"parts with fewer than {FEWEST_SEEDS} seeds decide nothing"
+    fewer = f"parts with fewer than {FEWEST_SEEDS} seeds stay open"
     return fewer if min(seeds) < FEWEST_SEEDS else ""
 
 

@@ -1,6 +1,6 @@
 """Statistics over seeds, of float64 arrays [seeds], after Agarwal et al. 2021 (docs/metrics.md).
 
-An interval is a pair (low, high), both NaN where one seed allows none.
+An interval is a pair (low, high), both NaN where there are too few seeds for one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -212,19 +212,21 @@ def probability_of_improvement(
 
     Each is [metrics], the mean over `pairs` (x [n, metrics], y [m, metrics]), one for each
     environment. x and y are resampled independently, the same draws for all metrics. Greater is
-    better.
+    better. The bounds are NaN with fewer than `BOOTSTRAP_SEEDS` in an environment.
     """
     metrics = pairs[0][0].shape[1]
     means, resampled = np.zeros(metrics), np.zeros((repetitions, metrics))
+    fewest = min(len(runs) for both in pairs for runs in both)
     for x, y in pairs:
         wins = np.heaviside(x[:, None] - y[None, :], 0.5)  # [n, m, metrics]
-        drawn_x, drawn_y = (single_draws(len(runs), repetitions, generator) for runs in (x, y))
         means += wins.mean(axis=(0, 1)) / len(pairs)
+        if fewest < BOOTSTRAP_SEEDS:
+            continue
+        drawn_x, drawn_y = (single_draws(len(runs), repetitions, generator) for runs in (x, y))
         halves = wins.astype(np.float32)  # of which sums of n · m are exact, and faster
         for metric in range(metrics):
             won = np.einsum("ry,ry->r", drawn_x @ halves[:, :, metric], drawn_y)
             resampled[:, metric] += won.astype(np.float64) / (len(x) * len(y) * len(pairs))
-    fewest = min(len(runs) for both in pairs for runs in both)
     low, high = percentiles(resampled, confidence, fewest)
     return means, low, high
 

@@ -35,7 +35,7 @@ def table2_latex(ppo: Mapping[str, PPOConfig], paper: Table2Config) -> str:
     """Table 2, the PPO hyperparameters: the paper's rows, a line, and this project's."""
     found = tables.table2(ppo, paper).to_numpy()
     rows = [rf"\raggedright {escaped(name)} & {latex_cell(value)} \\" for name, value in found]
-    needs = packages(" ".join(name for name, _ in found))
+    needs = packages(" ".join([*(name for name, _ in found), *ppo]))  # `ppo`: where values differ
     end = len(paper.rows) + 1  # and Adam
     what = "PPO hyperparameters: those of the paper, and below the line those that it leaves open."
     columns = r"tabular}{@{}p{0.42\linewidth}l@{}"

@@ -11,6 +11,7 @@ from mace_rl.base.tables import read_made, read_table
 from mace_study.compare.claims_config import ClaimsConfig, parts_of, undecided
 from mace_study.compare.comparisons import ALL
 from mace_study.compare.ledger import Answer
+from mace_study.compare.statistics import BOOTSTRAP_SEEDS
 from mace_study.compare.summary import from_to
 from mace_study.config.metrics import MetricsConfig
 from mace_study.measure.betas import LABELS, betas_columns
@@ -24,6 +25,8 @@ PARTS = (
     " corrected for all parts. claims.json has each part's margin, room, smallest detectable"
     " difference, p of equivalence, and the paper's own difference."
 )
+
+NO_INTERVAL = f" Below {BOOTSTRAP_SEEDS} seeds there is no interval."
 
 Data = Mapping[str, pd.DataFrame]  # by the name of the CSV file
 
@@ -123,6 +126,7 @@ def _compared(data: Data, settings: MetricsConfig) -> Iterator[Section]:
     table, means = data["comparisons"], pd.concat([data["table1"], data["supplement"]])
     for metric, title in RETURNS.items() if len(table) else ():
         note = "P: that a run of the first is better than one of the second; 0.5 is a coin's toss."
+        note += NO_INTERVAL if table["probability_low"].isna().any() else ""
         yield Section(f"{title}: who is better", note, tables.improvement(table, metric))
         note = (
             "Difference: mean over the seeds that both have (interval). p: of the sign-flip test,"
@@ -140,6 +144,7 @@ def _others(
     """All environments together, readings and β; asked: claims with metrics that they compare."""
     if data["metrics"]["env"].nunique() > 1:
         note = "Scores: 0 is the random policy, 1 the study's best run."
+        note += NO_INTERVAL if data["aggregate"]["mean_low"].isna().any() else ""
         yield Section("All environments together", note, tables.aggregate(data["aggregate"]))
     if "readings" in data:
         note = (
