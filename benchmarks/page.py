@@ -20,8 +20,8 @@ neither by hand. [docs/performance.md](../docs/performance.md) explains them.
 
 Rates and ratios are medians over the repeats, with their range in brackets. The line below each
 section's tables names its commit, which can be another one. An environment alone takes random
-actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs. Before commit 8a48ade
-`mace_full` was another variant: docs/performance.md says which.
+actions. `ppo_2048` is our PPO with 2048 steps and 4 full-batch epochs. Beside PureJaxRL everybody
+was compiled for AVX2. Before commit 8a48ade `mace_full` was another variant.
 """
 RATE = "environment steps per CPU second"
 
